@@ -1,0 +1,238 @@
+"""The message an agent sends in each frame: eight numbers an object, as in the paper, behind a small header.
+
+Layout of version 1, little endian throughout, A = length of the agent id in bytes, N = number of objects:
+
+| offset   | bytes | type    | content                                                                        |
+|----------|-------|---------|--------------------------------------------------------------------------------|
+| 0        | 4     | bytes   | magic, `CBVG`                                                                  |
+| 4        | 1     | uint8   | version, 1                                                                     |
+| 5        | 1     | uint8   | A, 1 to 64                                                                     |
+| 6        | 2     | uint16  | N, 0 to 4096                                                                   |
+| 8        | 4     | uint32  | frame: the sender's frame count                                                |
+| 12       | 8     | float64 | time stamp [s]                                                                 |
+| 20       | A     | UTF-8   | agent id, printable characters                                                 |
+| 20+A     | 32 N  | float32 | per object x, y, z, l, w, h [m], yaw [rad] in the sender's frame, and track id |
+| 20+A+32N | 4     | uint32  | CRC-32 (zlib's) of all bytes before it                                         |
+
+- Scores and labels are not sent: the paper sends eight numbers an object, and alignment needs no others.
+- Track ids are whole numbers from 0 to 2^24, which float32 holds exactly. Boxes without track ids carry -1 in every
+  row; -1 in only some rows is an error. A message without objects decodes to boxes without track ids.
+- A yaw outside [-pi, pi] is wrapped into it before it is rounded to float32, so that large angles lose nothing.
+- float32 rounds a coordinate of 100 m by at most 4 micrometres.
+- The CRC finds corruption (every single flipped bit among it), not forgery: a message is not authenticated.
+
+The length of these bytes is the communication volume of the boxes that is reported everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.se2 import wrap_angle
+from cobevglue.typing import Float32Array, IntArray
+
+__all__ = [
+    "BYTES_PER_OBJECT",
+    "MAX_AGENT_ID_BYTES",
+    "MAX_OBJECTS",
+    "MAX_TRACK_ID",
+    "VERSION",
+    "MessageError",
+    "ObjectMessage",
+    "decode",
+    "encode",
+    "encoded_size",
+]
+
+VERSION = 1
+"""The only layout written and read."""
+MAX_OBJECTS = 4096
+"""Most objects in one message: far above any scene, and it bounds a message at 131,160 bytes."""
+MAX_AGENT_ID_BYTES = 64
+"""Longest agent id, in bytes of its UTF-8 form."""
+MAX_TRACK_ID = 2**24
+"""Largest track id: up to here float32 holds every whole number exactly."""
+MAX_FRAME = 2**32 - 1
+"""Largest frame count: at 10 Hz, 13 years."""
+BYTES_PER_OBJECT = 32
+"""Eight float32."""
+
+_MAGIC = b"CBVG"
+_HEADER = struct.Struct("<4sBBHId")
+_CHECKSUM = struct.Struct("<I")
+_NO_TRACK_ID = -1
+_LARGEST_YAW = np.float32(np.pi)  # a little above pi: what the angles next to pi round to
+
+
+class MessageError(ValueError):
+    """A message that cannot be sent, or bytes that are not a whole, undamaged message of a known version."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectMessage:
+    """What one agent saw at one time.
+
+    Attributes:
+        agent_id: the sender; printable characters, 1 to 64 bytes of UTF-8.
+        time: time stamp of the boxes [s], finite.
+        frame: the sender's frame count, 0 to 2^32 - 1.
+        boxes: the objects, in the sender's own LiDAR frame. Scores and labels stay behind when the message is encoded.
+
+    Raises:
+        MessageError: a field is outside of its limits; it names the field.
+    """
+
+    agent_id: str
+    time: float
+    frame: int
+    boxes: Boxes
+
+    def __post_init__(self) -> None:
+        _agent_id_bytes(self.agent_id)
+        if not isinstance(self.time, (int, float, np.number)) or not math.isfinite(self.time):
+            raise MessageError(f"time must be a finite number of seconds, got {self.time!r}")
+        if not isinstance(self.frame, (int, np.integer)) or isinstance(self.frame, bool):
+            raise MessageError(f"frame must be a whole number, got {self.frame!r}")
+        if not 0 <= self.frame <= MAX_FRAME:
+            raise MessageError(f"frame must be from 0 to {MAX_FRAME}, got {self.frame}")
+        if not isinstance(self.boxes, Boxes):
+            raise MessageError(f"boxes must be Boxes, got {type(self.boxes).__name__}")
+        if len(self.boxes) > MAX_OBJECTS:
+            raise MessageError(f"boxes: {len(self.boxes)} objects, a message holds at most {MAX_OBJECTS}")
+        object.__setattr__(self, "time", float(self.time))
+        object.__setattr__(self, "frame", int(self.frame))
+
+
+def encoded_size(n_objects: int, agent_id: str) -> int:
+    """Bytes that a message of `agent_id` with `n_objects` takes: `len(encode(message))` without encoding.
+
+    Raises:
+        MessageError: more objects or a longer agent id than a message holds.
+    """
+    if not 0 <= n_objects <= MAX_OBJECTS:
+        raise MessageError(f"n_objects must be from 0 to {MAX_OBJECTS}, got {n_objects}")
+    return _HEADER.size + len(_agent_id_bytes(agent_id)) + BYTES_PER_OBJECT * n_objects + _CHECKSUM.size
+
+
+def encode(message: ObjectMessage) -> bytes:
+    """The bytes of a message, in the layout that this module's docstring describes.
+
+    Raises:
+        MessageError: a track id is negative or above 2^24, or a number does not survive as float32 (names field and
+            row). What is encoded always decodes.
+    """
+    agent_id = _agent_id_bytes(message.agent_id)
+    table = _table_of(message.boxes)
+    try:
+        _boxes_of(table)  # a size may round to zero, a coordinate to infinity: the receiver would have to refuse them
+    except ValueError as error:
+        raise MessageError(f"boxes do not fit float32: {error}") from None
+    header = _HEADER.pack(_MAGIC, VERSION, len(agent_id), len(message.boxes), message.frame, message.time)
+    body = header + agent_id + table.tobytes()
+    return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
+def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
+    """The message in these bytes.
+
+    Raises:
+        MessageError: these are not exactly one undamaged message of a known version with valid boxes; it says why.
+    """
+    if not isinstance(data, (bytes, bytearray, memoryview)):
+        raise MessageError(f"a message is bytes, got {type(data).__name__}")
+    data = bytes(data)
+    smallest = encoded_size(0, "?")
+    if len(data) < smallest:
+        raise MessageError(f"truncated: {len(data)} bytes, a message has at least {smallest}")
+    magic, version, id_length, n_objects, frame, time = _HEADER.unpack_from(data)
+    if magic != _MAGIC:
+        raise MessageError(f"not an object message: it starts with {magic!r} instead of {_MAGIC!r}")
+    if version != VERSION:
+        raise MessageError(f"unknown version {version}, only version {VERSION} can be read")
+    if not 1 <= id_length <= MAX_AGENT_ID_BYTES or n_objects > MAX_OBJECTS:
+        raise MessageError(
+            f"corrupted: the header has an agent id of {id_length} bytes (1 to {MAX_AGENT_ID_BYTES}) and {n_objects} "
+            f"objects (at most {MAX_OBJECTS})"
+        )
+    objects_start = _HEADER.size + id_length
+    objects_end = objects_start + BYTES_PER_OBJECT * n_objects
+    expected = objects_end + _CHECKSUM.size
+    if len(data) != expected:
+        what = "truncated" if len(data) < expected else "oversized"
+        raise MessageError(f"{what}: {len(data)} bytes, the header ({n_objects} objects) announces {expected}")
+    if zlib.crc32(data[:objects_end]) != _CHECKSUM.unpack_from(data, objects_end)[0]:
+        raise MessageError("corrupted: the checksum does not match")
+    # From here on the bytes are as they were sent, and only a sender's mistake can be wrong with them.
+    try:
+        agent_id = data[_HEADER.size : objects_start].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise MessageError(f"agent_id is not UTF-8: {error}") from None
+    table = np.frombuffer(data, dtype="<f4", count=8 * n_objects, offset=objects_start).reshape(n_objects, 8)
+    try:
+        boxes = _boxes_of(table)
+    except ValueError as error:
+        raise MessageError(f"invalid boxes: {error}") from None
+    return ObjectMessage(agent_id=agent_id, time=time, frame=frame, boxes=boxes)
+
+
+def _agent_id_bytes(agent_id: str) -> bytes:
+    """UTF-8 of a valid agent id; printable only, because ids end up in logs, tables and file names."""
+    if not isinstance(agent_id, str):
+        raise MessageError(f"agent_id must be a string, got {agent_id!r}")
+    if not agent_id.isprintable():  # also refuses lone surrogates, which UTF-8 cannot hold
+        raise MessageError(f"agent_id must be printable, got {agent_id!r}")
+    encoded = agent_id.encode("utf-8")
+    if not 1 <= len(encoded) <= MAX_AGENT_ID_BYTES:
+        raise MessageError(f"agent_id must have 1 to {MAX_AGENT_ID_BYTES} bytes in UTF-8, got {len(encoded)}")
+    return encoded
+
+
+def _table_of(boxes: Boxes) -> Float32Array:
+    """(N, 8) little-endian float32: x, y, z, l, w, h, yaw, track id."""
+    table = np.empty((len(boxes), 8), dtype="<f4")
+    with np.errstate(over="ignore", under="ignore"):  # what overflows or vanishes is refused by name afterwards
+        table[:, 0:3] = boxes.center
+        table[:, 3:6] = boxes.size
+        yaw = boxes.yaw.astype("<f4")
+        table[:, 6] = np.where(np.abs(yaw) <= _LARGEST_YAW, yaw, wrap_angle(boxes.yaw))
+    table[:, 7] = _NO_TRACK_ID if boxes.track_id is None else _sendable(boxes.track_id)
+    return table
+
+
+def _sendable(track_id: IntArray) -> IntArray:
+    """These track ids, all of which float32 holds exactly."""
+    wrong = (track_id < 0) | (track_id > MAX_TRACK_ID)
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise MessageError(
+            f"track_id: row {row} is {track_id[row]}, a message holds ids from 0 to {MAX_TRACK_ID} (2^24)"
+        )
+    return track_id
+
+
+def _boxes_of(sent: Float32Array) -> Boxes:
+    """The boxes of an (N, 8) table; ValueError with field and row where they are not valid."""
+    with np.errstate(invalid="ignore"):  # a signalling NaN would warn here; Boxes refuses it by name
+        table = sent.astype(np.float64)
+    track_id = table[:, 7]
+    absent = track_id == _NO_TRACK_ID
+    if not absent.all():
+        in_range = (track_id >= 0) & (track_id <= MAX_TRACK_ID) & (np.floor(track_id) == track_id)
+        if not in_range.all():
+            row = int((~in_range).argmax())
+            raise ValueError(
+                f"track_id: row {row} is {track_id[row]}; "
+                f"ids are whole numbers from 0 to {MAX_TRACK_ID}, or -1 in all rows"
+            )
+    return Boxes(
+        center=table[:, 0:3],
+        size=table[:, 3:6],
+        yaw=table[:, 6],
+        track_id=None if absent.all() else track_id,
+    )
