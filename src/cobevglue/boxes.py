@@ -76,6 +76,10 @@ class Boxes:
             columns[field.name] = None if any(v is None for v in values) else np.concatenate(values)
         return cls(**columns)
 
+    def __reduce__(self) -> tuple[type[Boxes], tuple[FloatArray | IntArray | StrArray | None, ...]]:
+        # Copies and pickles go through the constructor: numpy would restore the arrays writable.
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
+
     def __len__(self) -> int:
         return len(self.yaw)
 
@@ -124,8 +128,12 @@ def _row_count(center: ArrayLike) -> int:
 
 def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "biufO":  # text would be parsed silently, complex numbers lose their imaginary part
+            raise ValueError(f"these are {raw.dtype}")
+        array = np.array(raw, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        _refuse_first_bad_row(name, values, shape[1:])
         raise ValueError(f"{name} must be numbers of shape {shape}: {error}") from None
     if array.size == 0 and shape[0] == 0:
         array = array.reshape(shape)
@@ -138,17 +146,43 @@ def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
+def _refuse_first_bad_row(name: str, values: ArrayLike, shape: tuple[int, ...]) -> None:
+    """Raise a ValueError that names the first row that is not numbers of this shape, if there is one."""
+    rows = values if isinstance(values, (list, tuple, np.ndarray)) else []
+    for number, row in enumerate(rows):
+        try:
+            array = np.asarray(row)
+            good = array.shape == shape and array.dtype.kind in "biufO" and array.astype(np.float64) is not None
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            raise ValueError(
+                f"{name}: row {number} must be {'a number' if not shape else f'{shape[0]} numbers'}: {row!r}"
+            )
+
+
 def _unique_integers(values: ArrayLike, n: int) -> IntArray:
-    numbers = _finite("track_id", values, (n,))
-    ids = numbers.astype(np.int64)
-    if (ids != numbers).any():
-        row = int((ids != numbers).argmax())
-        raise ValueError(f"track_id: row {row} is not an integer: {numbers[row]}")
+    ids = _integers(values, n)
     order = np.argsort(ids, kind="stable")
     repeated = ids[order][1:] == ids[order][:-1]
     if repeated.any():
         first, second = order[repeated.argmax()], order[repeated.argmax() + 1]
         raise ValueError(f"track_id: rows {first} and {second} have the same id {ids[first]}")
+    return ids
+
+
+def _integers(values: ArrayLike, n: int) -> IntArray:
+    """(n,) whole numbers; integers are taken as they are, since above 2^53 a detour over floats would change them."""
+    numbers = _finite("track_id", values, (n,))
+    in_range = np.abs(numbers) < 2.0**63
+    if not in_range.all():
+        row = int((~in_range).argmax())
+        raise ValueError(f"track_id: row {row} is {numbers[row]:.0f}, ids must be below 2^63")
+    raw = np.asarray(values)
+    ids: IntArray = (raw if raw.dtype.kind in "iu" else numbers).astype(np.int64).reshape(n)
+    if raw.dtype.kind not in "iu" and (ids != numbers).any():
+        row = int((ids != numbers).argmax())
+        raise ValueError(f"track_id: row {row} is not an integer: {numbers[row]}")
     return ids
 
 

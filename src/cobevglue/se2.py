@@ -14,8 +14,10 @@ __all__ = ["SE2", "wrap_angle"]
 
 def wrap_angle(angle: ArrayLike) -> FloatArray:
     """The same angle in [-pi, pi), elementwise [rad]."""
-    wrapped: FloatArray = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
-    return wrapped
+    wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    # Just below -pi the remainder rounds to 2 pi, and the result would be +pi.
+    in_interval: FloatArray = wrapped - 2.0 * np.pi * (wrapped >= np.pi)
+    return in_interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,11 @@ class SE2:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "yaw"):
-            value = float(getattr(self, name))
+            given = getattr(self, name)
+            try:
+                value = float(given)
+            except (TypeError, ValueError):
+                raise ValueError(f"SE2.{name} must be a number, got {given!r}") from None
             if not math.isfinite(value):
                 raise ValueError(f"SE2.{name} must be finite, got {value}")
             object.__setattr__(self, name, value)
@@ -49,7 +55,8 @@ class SE2:
         """The planar part of a homogeneous (3, 3) planar or (4, 4) spatial transform: roll, pitch and z are dropped.
 
         Raises:
-            ValueError: another shape, a value that is not finite, or no rotation (left-handed or scaled).
+            ValueError: another shape, a value that is not finite, no rotation (left-handed or scaled), or a last row
+                other than 0 … 0 1 (a transposed matrix, whose translation would be lost).
         """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape not in ((3, 3), (4, 4)):
@@ -59,6 +66,8 @@ class SE2:
             raise ValueError("matrix must be finite with an orthonormal rotation part")
         if np.linalg.det(rotation) < 0:
             raise ValueError("matrix must be a proper rotation (right-handed), its determinant is -1")
+        if not np.allclose(m[-1], np.eye(len(m))[-1], atol=1e-6):
+            raise ValueError(f"matrix must be homogeneous with a last row of zeros and a one, got {m[-1].tolist()}")
         return cls(m[0, -1], m[1, -1], math.atan2(m[1, 0], m[0, 0]))
 
     @property
@@ -109,10 +118,16 @@ class SE2:
         return SE2(
             self.x + c * other.x - s * other.y,
             self.y + s * other.x + c * other.y,
-            (self.yaw + other.yaw + math.pi) % (2.0 * math.pi) - math.pi,
+            _wrap(self.yaw + other.yaw),
         )
 
     def error_to(self, reference: SE2) -> tuple[float, float]:
         """How far this transform is from `reference`: translation [m] and absolute yaw difference [rad]."""
-        yaw = abs((self.yaw - reference.yaw + math.pi) % (2.0 * math.pi) - math.pi)
+        yaw = abs(_wrap(self.yaw - reference.yaw))
         return math.hypot(self.x - reference.x, self.y - reference.y), yaw
+
+
+def _wrap(angle: float) -> float:
+    """`wrap_angle` of one number, without numpy's overhead."""
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi
