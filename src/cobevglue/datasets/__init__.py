@@ -1,0 +1,35 @@
+"""Data sets of collaborative perception, all giving the same `Frame`; and text files of tracking.
+
+    for frame in OPV2V(root, split="test_culvercity")["TwoCars_1"]:
+        frame.agents["car1"].points           # (N, 4) x, y, z, intensity, the agent's LiDAR frame
+        frame.agents["car1"].world_SE3_lidar  # (4, 4)
+        frame.agents["car1"].objects          # Boxes, the agent's LiDAR frame
+
+Everything is right-handed (x forward, y left, z up) whatever the files are, and read when it is used.
+"""
+
+from cobevglue.datasets.dair_v2x import DAIRV2X
+from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario
+from cobevglue.datasets.opv2v import OPV2V, V2XSet
+from cobevglue.datasets.opv2v_writer import write_opv2v_frame
+from cobevglue.datasets.pcd import read_pcd
+from cobevglue.datasets.poses import transform_boxes
+from cobevglue.datasets.v2v4real import V2V4Real
+
+DATASETS: dict[str, type[Dataset]] = {"opv2v": OPV2V, "v2xset": V2XSet, "v2v4real": V2V4Real, "dair-v2x": DAIRV2X}
+"""Data sets by the name that users type; each is made from (root, split)."""
+
+__all__ = [
+    "DAIRV2X",
+    "DATASETS",
+    "OPV2V",
+    "AgentFrame",
+    "Dataset",
+    "Frame",
+    "Scenario",
+    "V2V4Real",
+    "V2XSet",
+    "read_pcd",
+    "transform_boxes",
+    "write_opv2v_frame",
+]

@@ -1,0 +1,85 @@
+"""OPV2V and V2XSet: simulated (CARLA, 10 Hz), poses exact, object ids the same for all agents of a scenario.
+
+Both are left-handed on disk. A yaml file lists the objects that at least one point of its agent hit, in the world
+frame: location, box centre offset, half extents and angle [roll, yaw, pitch]. Objects are moved to the LiDAR frame of
+their agent in three dimensions and then set upright.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.pcd import read_pcd
+from cobevglue.datasets.poses import SE3_from_carla, inverse_SE3, mirrored, rigid_SE3, upright_yaw
+from cobevglue.datasets.yaml_tree import LabelReader, YamlTree, read_objects
+from cobevglue.typing import ArrayLike, Float32Array, FloatArray
+
+__all__ = ["OPV2V", "V2XSet", "read_opv2v_labels"]
+
+
+class OPV2V(YamlTree):
+    """OPV2V: `OPV2V(root, split="test_culvercity")["TwoCars_1"]` is a scenario, a sequence of frames.
+
+    `root` holds the splits as folders; a split written by `cobevglue simulate` is read by its own name. Nothing but
+    folder listings is read before a frame's cloud, pose or objects are used.
+    """
+
+    splits: ClassVar[tuple[str, ...]] = ("train", "validate", "test", "test_culvercity")
+
+    def _label_reader(self, agent: str) -> LabelReader:
+        return read_opv2v_labels
+
+    def _read_points(self, path: Path) -> Float32Array:
+        return read_pcd(path, left_handed=True)
+
+
+class V2XSet(OPV2V):
+    """V2XSet: OPV2V's tree with roadside units, whose agent ids are negative (`is_infrastructure`)."""
+
+    splits: ClassVar[tuple[str, ...]] = ("train", "validate", "test")
+
+
+def read_opv2v_labels(path: Path) -> tuple[FloatArray, Boxes]:
+    """Pose and objects in a yaml file of OPV2V or V2XSet.
+
+    Args:
+        path: the file.
+
+    Returns:
+        world_SE3_lidar (4, 4), a proper rotation, and the objects in the LiDAR frame with ids and labels.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: it is broken; names the file, the object and the field.
+    """
+    lidar_pose, table = read_objects(path)
+    world_SE3_lidar = _lidar_pose(path, lidar_pose)
+    lidar_SE3_object = inverse_SE3(world_SE3_lidar) @ SE3_from_carla(table.pose)
+    try:
+        boxes = Boxes(
+            center=lidar_SE3_object[:, :3, 3],
+            size=table.size,
+            yaw=upright_yaw(lidar_SE3_object),
+            track_id=table.ids,
+            label=table.kinds,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: vehicles: {error}") from None
+    return world_SE3_lidar, boxes
+
+
+def _lidar_pose(path: Path, lidar_pose: ArrayLike) -> FloatArray:
+    """Six numbers, or a 4x4 matrix as some redistributions of the data have it."""
+    try:
+        values = np.asarray(lidar_pose, dtype=np.float64)
+        if values.shape == (4, 4):
+            return rigid_SE3(mirrored(values))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: lidar_pose {error}") from None
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise ValueError(f"{path}: lidar_pose must be six finite numbers (x, y, z, roll, yaw, pitch), got {lidar_pose}")
+    return SE3_from_carla(values)

@@ -1,0 +1,103 @@
+"""Writes frames in OPV2V's own layout, so that whatever reads OPV2V reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.pcd import write_pcd_rgb
+from cobevglue.datasets.poses import carla_from_SE3, rigid_SE3
+from cobevglue.typing import ArrayLike
+
+__all__ = ["write_opv2v_frame"]
+
+try:
+    from yaml import CSafeDumper as _SafeDumper
+except ImportError:  # PyYAML built without libyaml
+    from yaml import SafeDumper as _SafeDumper  # type: ignore[assignment]
+
+
+def write_opv2v_frame(
+    agent_folder: str | Path,
+    timestamp: str,
+    world_SE3_lidar: ArrayLike,
+    objects: Boxes,
+    points: ArrayLike | None = None,
+    *,
+    speeds: Mapping[int, float] | None = None,
+    ego_speed: float = 0.0,
+    world_SE3_vehicle: ArrayLike | None = None,
+) -> None:
+    """Write what one agent had at one time: `<timestamp>.yaml`, and `<timestamp>.pcd` if there is a cloud.
+
+    The inverse of reading: `OPV2V` gives back pose and objects to the precision of floats, points exactly and
+    intensities to 8 bits. Axes are mirrored to OPV2V's left-handed ones. Labels are kept under `obj_type`.
+
+    Args:
+        agent_folder: `<root>/<split>/<scenario>/<agent>`; made if it is not there. Roadside units have negative names.
+        timestamp: file number as text, digits only; frames 0.1 s apart are numbered 2 apart, as OPV2V does.
+        world_SE3_lidar: (4, 4) right-handed pose of the LiDAR.
+        objects: the objects that the agent could see, in its LiDAR frame, with `track_id`.
+        points: (N, 4) x, y, z [m], intensity [0, 1] in the LiDAR frame; None to store no cloud.
+        speeds: km/h of objects by id; 0 where left out.
+        ego_speed: km/h of the agent.
+        world_SE3_vehicle: (4, 4) right-handed pose of the vehicle on the ground; that of the LiDAR where left out.
+
+    Raises:
+        ValueError: a pose is not rigid, the timestamp is not a number, objects have no ids, or points are malformed.
+    """
+    if not (timestamp.isascii() and timestamp.isdigit()):
+        raise ValueError(f"timestamp must be digits, like '000068', got {timestamp!r}")
+    if objects.track_id is None:
+        raise ValueError("objects must have a track_id")
+    lidar = _checked_pose("world_SE3_lidar", world_SE3_lidar)
+    vehicle = lidar if world_SE3_vehicle is None else _checked_pose("world_SE3_vehicle", world_SE3_vehicle)
+    poses = carla_from_SE3(lidar @ _lidar_SE3_object(objects))
+    offset = np.zeros((len(objects), 3))
+    offset[:, 2] = objects.size[:, 2] / 2  # OPV2V's location is on the ground, its `center` lifts it to the box centre
+    vehicles: dict[int, dict[str, Any]] = {}
+    for row, track_id in enumerate(objects.track_id.tolist()):
+        vehicles[track_id] = {
+            "angle": poses[row, 3:].tolist(),
+            "center": offset[row].tolist(),
+            "extent": (objects.size[row] / 2).tolist(),
+            "location": (poses[row, :3] - offset[row]).tolist(),
+            "speed": float((speeds or {}).get(track_id, 0.0)),
+        }
+        if objects.label is not None:
+            vehicles[track_id]["obj_type"] = str(objects.label[row])
+    document = {
+        "ego_speed": float(ego_speed),
+        "lidar_pose": carla_from_SE3(lidar).tolist(),
+        "predicted_ego_pos": carla_from_SE3(vehicle).tolist(),
+        "true_ego_pos": carla_from_SE3(vehicle).tolist(),
+        "vehicles": vehicles,
+    }
+    folder = Path(agent_folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if points is not None:
+        write_pcd_rgb(folder / f"{timestamp}.pcd", points)
+    with (folder / f"{timestamp}.yaml").open("w", encoding="utf-8") as file:
+        yaml.dump(document, file, Dumper=_SafeDumper)
+
+
+def _checked_pose(name: str, matrix: ArrayLike) -> ArrayLike:
+    try:
+        return rigid_SE3(matrix)
+    except ValueError as error:
+        raise ValueError(f"{name} {error}") from None
+
+
+def _lidar_SE3_object(objects: Boxes) -> ArrayLike:
+    """(N, 4, 4) poses of upright boxes."""
+    matrix = np.zeros((len(objects), 4, 4))
+    c, s = np.cos(objects.yaw), np.sin(objects.yaw)
+    matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1] = c, -s, s, c
+    matrix[:, 2, 2] = matrix[:, 3, 3] = 1.0
+    matrix[:, :3, 3] = objects.center
+    return matrix

@@ -1,0 +1,93 @@
+"""LiDAR clouds in PCD files: ASCII, binary and binary_compressed, with the intensity where the data sets hide it."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cobevglue.typing import ArrayLike, Float32Array
+
+__all__ = ["read_pcd", "write_pcd_rgb"]
+
+
+def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
+    """Points of a PCD file; those with a coordinate that is not finite (no return) are left out.
+
+    OPV2V was written through Open3D, which knows no intensity: it is the red byte of the packed colour `rgb`, a 32-bit
+    integer stored under the type float. In ASCII files that shows as numbers like 1.5e-38.
+
+    Args:
+        path: the file, with fields x, y, z and either `intensity`, or `rgb`; with neither the intensity is 0.
+        left_handed: the file has y to the right: mirror it.
+        intensity_scale: factor that brings the field `intensity` to [0, 1]. Not applied to `rgb`, which is 8 bit.
+
+    Returns:
+        (N, 4) x, y, z [m], intensity in [0, 1]; x forward, y left, z up.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: it cannot be read as PCD, or is shorter than its header says; names the file.
+    """
+    data = _columns(path)
+    names = data.dtype.names or ()
+    missing = [name for name in ("x", "y", "z") if name not in names]
+    if missing:
+        raise ValueError(f"{path}: no field {missing[0]!r} among the fields {', '.join(names)}")
+    points = np.zeros((len(data), 4), dtype=np.float32)
+    for column, name in enumerate(("x", "y", "z")):
+        points[:, column] = data[name]
+    if left_handed:
+        points[:, 1] *= -1.0
+    if "intensity" in names:
+        points[:, 3] = np.clip(data["intensity"].astype(np.float64) * intensity_scale, 0.0, 1.0)
+    elif "rgb" in names:
+        if data.dtype["rgb"].itemsize != 4:
+            raise ValueError(f"{path}: the field 'rgb' must have 4 bytes, got {data.dtype['rgb'].itemsize}")
+        packed = np.ascontiguousarray(data["rgb"]).view(np.uint32)
+        points[:, 3] = ((packed >> 16) & 0xFF) / 255.0
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def write_pcd_rgb(path: Path, points: ArrayLike) -> None:
+    """Write a cloud the way OPV2V stores it: binary PCD, y to the right, the intensity in the red byte of `rgb`.
+
+    Args:
+        path: the file; an existing one is replaced.
+        points: (N, 4) x, y, z [m], y to the left, and intensity in [0, 1], of which 8 bits are kept.
+
+    Raises:
+        ValueError: the points have another shape, are not finite, or an intensity is not in [0, 1].
+    """
+    from pypcd4.pypcd4 import Encoding, PointCloud  # imported here: it takes longer than the rest of the package
+
+    cloud = np.asarray(points, dtype=np.float32)
+    if cloud.ndim != 2 or cloud.shape[1] != 4:
+        raise ValueError(f"points must have shape (N, 4), got {cloud.shape}")
+    if not np.isfinite(cloud).all() or (cloud[:, 3] < 0).any() or (cloud[:, 3] > 1).any():
+        raise ValueError("points must be finite with intensities in [0, 1]")
+    red = np.rint(cloud[:, 3] * 255.0).astype(np.uint32) << 16
+    columns = [cloud[:, 0], -cloud[:, 1], cloud[:, 2], red.view(np.float32)]
+    PointCloud.from_points(columns, ("x", "y", "z", "rgb"), (np.float32,) * 4).save(path, encoding=Encoding.BINARY)
+
+
+def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
+    """The points of a file as a structured array with a column for each field."""
+    from pypcd4.pypcd4 import PointCloud
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is not there")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy warns of an empty table; the count below says more
+            cloud = PointCloud.from_path(path)
+        # (a table of one row loses its axis in numpy's text reader)
+        data: np.ndarray[tuple[int], np.dtype[Any]] = np.atleast_1d(cloud.pc_data)
+        promised = int(cloud.metadata.points)
+    except Exception as error:  # a parser of foreign bytes: pydantic, struct, lzf, numpy and lookup errors
+        raise ValueError(f"{path}: not readable as PCD: {' '.join(str(error).split())[:200]}") from None
+    if len(data) != promised:
+        raise ValueError(f"{path}: the header promises {promised} points, the file has {len(data)}")
+    return data

@@ -1,0 +1,117 @@
+"""Poses of left-handed data sets and boxes given in three dimensions, brought to the axes used everywhere else.
+
+Inside the package axes are right-handed: x forward, y left, z up. CARLA's are left-handed: x forward, y right, z up;
+its yaw turns x towards y (clockwise seen from above), its pitch lifts the nose. Mirroring y turns one into the other:
+a transform T becomes M T M with M = diag(1, -1, 1, 1), which is again a proper rotation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.typing import ArrayLike, FloatArray
+
+__all__ = ["SE3_from_carla", "carla_from_SE3", "inverse_SE3", "mirrored", "rigid_SE3", "transform_boxes", "upright_yaw"]
+
+
+def SE3_from_carla(pose: ArrayLike) -> FloatArray:
+    """Right-handed transforms from CARLA poses.
+
+    Args:
+        pose: (..., 6) x, y, z [m], roll, yaw, pitch [degrees] (note the order), left-handed, as stored by OPV2V.
+
+    Returns:
+        (..., 4, 4) proper rigid transforms: parent_SE3_body.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    roll, yaw, pitch = np.moveaxis(np.deg2rad(pose[..., 3:]), -1, 0)
+    # CARLA's rotation is Rz(yaw) Ry(-pitch) Rx(-roll), written with the usual elementary matrices. Mirroring y reverses
+    # the turns about x and z and keeps those about y: Rz(-yaw) Ry(-pitch) Rx(roll).
+    yaw, pitch = -yaw, -pitch
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
+    matrix = np.zeros((*pose.shape[:-1], 4, 4))
+    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    matrix[..., 2, 0], matrix[..., 2, 1], matrix[..., 2, 2] = -sp, cp * sr, cp * cr
+    matrix[..., :3, 3] = pose[..., :3] * [1.0, -1.0, 1.0]
+    matrix[..., 3, 3] = 1.0
+    return matrix
+
+
+def carla_from_SE3(matrix: ArrayLike) -> FloatArray:
+    """CARLA poses of right-handed transforms: the inverse of `SE3_from_carla`.
+
+    Args:
+        matrix: (..., 4, 4) proper rigid transforms.
+
+    Returns:
+        (..., 6) x, y, z [m], roll, yaw, pitch [degrees], left-handed.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    roll = np.arctan2(m[..., 2, 1], m[..., 2, 2])
+    pitch = np.arctan2(-m[..., 2, 0], np.hypot(m[..., 0, 0], m[..., 1, 0]))
+    yaw = np.arctan2(m[..., 1, 0], m[..., 0, 0])
+    angles = np.rad2deg(np.stack([roll, -yaw, -pitch], axis=-1))
+    return np.concatenate([m[..., :3, 3] * [1.0, -1.0, 1.0], angles], axis=-1)
+
+
+def mirrored(matrix: ArrayLike) -> FloatArray:
+    """Transforms (..., 4, 4) with the y axis of both frames turned round: M T M, from left- to right-handed or back."""
+    signs = np.array([1.0, -1.0, 1.0, 1.0])
+    result: FloatArray = np.asarray(matrix, dtype=np.float64) * np.outer(signs, signs)
+    return result
+
+
+def rigid_SE3(matrix: ArrayLike) -> FloatArray:
+    """The proper rigid transform next to a stored (4, 4) matrix: its rotation is made exactly orthonormal.
+
+    Raises:
+        ValueError: another shape, a value that is not finite, or a matrix further than rounding from a rigid transform.
+    """
+    try:
+        m = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("must be a 4x4 matrix of numbers") from None
+    if m.shape != (4, 4) or not np.isfinite(m).all():
+        raise ValueError(f"must be a finite 4x4 matrix, got shape {m.shape}" if m.shape != (4, 4) else "is not finite")
+    left, scale, right = np.linalg.svd(m[:3, :3])
+    if np.abs(scale - 1.0).max() > 1e-2 or np.abs(m[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise ValueError("is not a rigid transform (its rotation is not orthonormal or its last row is not 0 0 0 1)")
+    if np.linalg.det(m[:3, :3]) < 0:
+        raise ValueError("is not a proper rotation (its determinant is -1)")
+    m[:3, :3] = left @ right
+    m[3] = [0.0, 0.0, 0.0, 1.0]
+    return m
+
+
+def inverse_SE3(matrix: FloatArray) -> FloatArray:
+    """The inverse (..., 4, 4) of rigid transforms (..., 4, 4)."""
+    inverse = np.zeros_like(matrix)
+    inverse[..., :3, :3] = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", inverse[..., :3, :3], matrix[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def upright_yaw(matrix: FloatArray) -> FloatArray:
+    """Heading [rad] of bodies with these poses (..., 4, 4), seen from above: roll and pitch are dropped."""
+    yaw: FloatArray = np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0])
+    return yaw
+
+
+def transform_boxes(boxes: Boxes, dst_SE3_src: FloatArray) -> Boxes:
+    """Boxes given in src in the dst frame, upright there.
+
+    Unlike `Boxes.transform` this takes the full spatial transform, with which two agents on a slope still agree on
+    the heights. What the transform tilts is flattened.
+
+    Args:
+        boxes: N boxes in the src frame.
+        dst_SE3_src: (4, 4) rigid transform.
+    """
+    heading = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw), np.zeros(len(boxes))], axis=-1) @ dst_SE3_src[:3, :3].T
+    return boxes.replace(
+        center=boxes.center @ dst_SE3_src[:3, :3].T + dst_SE3_src[:3, 3],
+        yaw=np.arctan2(heading[:, 1], heading[:, 0]),
+    )

@@ -1,0 +1,126 @@
+"""YAML files, read safely: nothing in a file can run code, numpy arrays and numbers included.
+
+V2V4Real (and files written by scripts that dump numpy values) tag arrays the way PyYAML's full dumper does, as calls to
+numpy's pickle helpers. The usual answer is an unsafe loader, which would run any call named in the file. Here just
+these helpers, with numeric types only, are understood and decoded; every other tag is an error.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Hashable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cobevglue.typing import ArrayLike
+
+__all__ = ["read_yaml"]
+
+try:
+    from yaml import CSafeLoader as _SafeLoader
+except ImportError:  # PyYAML built without libyaml: slower, same result
+    from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
+
+_TOP_LEVEL_KEY = re.compile(r"(?m)^(?=[A-Za-z_]\w*:)")
+
+
+def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
+    """The top-level mapping of a YAML file.
+
+    Args:
+        path: the file.
+        keys: the top-level keys of interest; others may be left out of the result, unparsed, which saves time on files
+            that hold much more (cameras, planned trajectories).
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: it is not YAML, not a mapping, or has a tag that is not plain data; names the file.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is not there") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file: {error}") from None
+    # An alias may point to an anchor in another block, so such files are read whole.
+    if not re.search(r"(?m)(?:[:-] |^)[&*]\w", text):
+        blocks = _TOP_LEVEL_KEY.split(text)
+        text = "".join(block for block in blocks if block.partition(":")[0] in keys) or text
+    try:
+        document = yaml.load(text, Loader=_NumpySafeLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(document, dict):
+        raise ValueError(f"{path}: must be a mapping with {', '.join(keys)}, got {type(document).__name__}")
+    return document
+
+
+class _NumpySafeLoader(_SafeLoader):
+    """The safe loader plus tuples and numeric numpy arrays, scalars and types."""
+
+
+class _NdarrayName:
+    """Stands for the name `numpy.ndarray` in a file."""
+
+
+def _parts(loader: Any, node: yaml.Node) -> tuple[list[Any], Any]:
+    """Arguments and state of a tagged call: written as a mapping, or as a plain sequence of arguments."""
+    if isinstance(node, yaml.MappingNode):
+        call: dict[Hashable, Any] = loader.construct_mapping(node, deep=True)
+        if not set(call) <= {"args", "state"}:
+            raise _bad(node, "has more than args and state")
+        return call.get("args", []), call.get("state")
+    return loader.construct_sequence(node, deep=True), None
+
+
+def _bad(node: yaml.Node, why: str) -> yaml.constructor.ConstructorError:
+    return yaml.constructor.ConstructorError(None, None, f"a numpy value here {why}", node.start_mark)
+
+
+def _dtype(loader: Any, node: yaml.Node) -> np.dtype[Any]:
+    args, state = _parts(loader, node)
+    name = args[0] if args else None
+    if not isinstance(name, str) or re.fullmatch(r"[fiu][248]|[iub]1", name) is None:
+        raise _bad(node, f"has the type {name!r}, which is no plain number")
+    order = state[1] if isinstance(state, tuple | list) and len(state) > 1 else "="
+    if order not in ("<", ">", "=", "|"):
+        raise _bad(node, f"has the byte order {order!r}")
+    return np.dtype(name if order == "|" else order + name)
+
+
+def _array(loader: Any, node: yaml.Node) -> ArrayLike:
+    args, state = _parts(loader, node)
+    if not args or not isinstance(args[0], _NdarrayName) or not isinstance(state, tuple | list) or len(state) != 5:
+        raise _bad(node, "is not an array as PyYAML writes it")
+    _, shape, dtype, column_major, data = state
+    if not isinstance(dtype, np.dtype) or not isinstance(data, bytes):
+        raise _bad(node, "is not an array of numbers")
+    try:
+        return np.frombuffer(data, dtype=dtype).reshape(shape, order="F" if column_major else "C").astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise _bad(node, f"does not have the size it claims: {error}") from None
+
+
+def _scalar(loader: Any, node: yaml.Node) -> float:
+    args, _ = _parts(loader, node)
+    if len(args) != 2 or not isinstance(args[0], np.dtype) or not isinstance(args[1], bytes):
+        raise _bad(node, "is not a number as PyYAML writes it")
+    if len(args[1]) != args[0].itemsize:
+        raise _bad(node, "does not have the size it claims")
+    return float(np.frombuffer(args[1], dtype=args[0])[0])
+
+
+def _tuple(loader: Any, node: yaml.Node) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+_PYTHON = "tag:yaml.org,2002:python/"
+_NumpySafeLoader.add_constructor(f"{_PYTHON}tuple", _tuple)
+_NumpySafeLoader.add_constructor(f"{_PYTHON}name:numpy.ndarray", lambda loader, node: _NdarrayName())
+_NumpySafeLoader.add_constructor(f"{_PYTHON}object/apply:numpy.dtype", _dtype)
+for _module in ("numpy.core.multiarray", "numpy._core.multiarray"):  # numpy 1 and 2
+    _NumpySafeLoader.add_constructor(f"{_PYTHON}object/apply:{_module}._reconstruct", _array)
+    _NumpySafeLoader.add_constructor(f"{_PYTHON}object/apply:{_module}.scalar", _scalar)

@@ -1,0 +1,263 @@
+"""Text files of multi-object tracking in the layout of AB3DMOT: boxes per frame, detected or labelled.
+
+Every reader returns one `Boxes` a frame, for frames 0 to `frame_count - 1`, empty ones included, so that sequences of
+several files (two agents; detections and labels) go side by side: `frame_count` is by default the last frame in the
+file plus one, and `count_frames` gives that over several files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.v2v4real import LEFT_HANDED
+
+__all__ = [
+    "count_frames",
+    "read_kitti_detections",
+    "read_kitti_labels",
+    "read_v2v4real_detections",
+    "read_v2v4real_labels",
+]
+
+_DETECTED_KINDS = {1: "pedestrian", 2: "car", 3: "cyclist"}
+
+
+class _Row(NamedTuple):
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+    score: float | None
+    track_id: int | None
+    label: str
+
+
+def count_frames(*paths: str | Path) -> int:
+    """The last frame number in any of these files plus one, 0 if they are empty."""
+    return max((_frame(path, *line) for path in map(Path, paths) for line in _lines(path)), default=-1) + 1
+
+
+def read_v2v4real_detections(
+    path: str | Path, frame_count: int | None = None, left_handed: bool = LEFT_HANDED
+) -> list[Boxes]:
+    """Detections of one car of V2V4Real, both cars' in the LiDAR frame of the ego car.
+
+    A line is `frame,type,0,0,0,0,score,h,w,l,x,z,y,yaw,0` with x, y, z the box centre.
+
+    Args:
+        path: the file.
+        frame_count: how many frames to return.
+        left_handed: take y as to the right, and mirror (the text of `cobevglue.datasets.v2v4real` says why not).
+
+    Returns:
+        A `Boxes` with score and label per frame.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
+    """
+
+    def parse(words: list[str]) -> _Row:
+        kind, *_, score, height, width, length, x, z, y, yaw, _ = _floats(words[1:])
+        return _on_the_ground((x, y, z), (length, width, height), yaw, score, None, _detected_kind(kind), left_handed)
+
+    return _read(path, 15, parse, frame_count)
+
+
+def read_v2v4real_labels(
+    path: str | Path, frame_count: int | None = None, left_handed: bool = LEFT_HANDED
+) -> list[Boxes]:
+    """Labelled tracks of V2V4Real in the LiDAR frame of the ego car; the ego car's own box is among them.
+
+    A line is `frame id class` seven times 0, then `h w l x z y yaw`, with x, y, z the box centre.
+
+    Args:
+        path: the file.
+        frame_count: how many frames to return.
+        left_handed: take y as to the right, and mirror.
+
+    Returns:
+        A `Boxes` with track_id and label per frame.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: a line is broken or repeats an id in its frame; names the file and the line.
+    """
+
+    def parse(words: list[str]) -> _Row:
+        height, width, length, x, z, y, yaw = _floats(words[10:])
+        return _on_the_ground(
+            (x, y, z), (length, width, height), yaw, None, _track_id(words[1]), words[2].lower(), left_handed
+        )
+
+    return _read(path, 17, parse, frame_count)
+
+
+def read_kitti_detections(path: str | Path, frame_count: int | None = None) -> list[Boxes]:
+    """Detections on a KITTI tracking sequence, in a frame at the camera with x forward, y left, z up.
+
+    A line is `frame,type,` four numbers of the box in the image, `score,h,w,l,x,y,z,rotation_y,alpha` in camera
+    coordinates. Scores are the detector's own and not confined to [0, 1].
+
+    Args:
+        path: the file.
+        frame_count: how many frames to return.
+
+    Returns:
+        A `Boxes` with score and label per frame.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
+    """
+
+    def parse(words: list[str]) -> _Row:
+        kind, *_, score, height, width, length, x, y, z, rotation_y, _ = _floats(words[1:])
+        return _from_camera((x, y, z), (length, width, height), rotation_y, score, None, _detected_kind(kind))
+
+    return _read(path, 15, parse, frame_count)
+
+
+def read_kitti_labels(
+    path: str | Path, classes: Collection[str] = ("car",), frame_count: int | None = None
+) -> list[Boxes]:
+    """Labelled tracks of a KITTI tracking sequence, in a frame at the camera with x forward, y left, z up.
+
+    A line is `frame id class truncated occluded alpha` four numbers of the box in the image `h w l x y z rotation_y`.
+
+    Args:
+        path: the file.
+        classes: the classes to keep, in any case; "DontCare" regions have no box in space.
+        frame_count: how many frames to return.
+
+    Returns:
+        A `Boxes` with track_id and lower-case label per frame.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: a line is broken or repeats an id in its frame; names the file and the line.
+    """
+    kept = {name.lower() for name in classes}
+
+    def parse(words: list[str]) -> _Row | None:
+        if words[2].lower() not in kept:
+            return None
+        height, width, length, x, y, z, rotation_y = _floats(words[10:])
+        size = (length, width, height)
+        return _from_camera((x, y, z), size, rotation_y, None, _track_id(words[1]), words[2].lower())
+
+    return _read(path, 17, parse, frame_count)
+
+
+def _on_the_ground(
+    xyz: tuple[float, float, float],
+    size: tuple[float, float, float],
+    yaw: float,
+    score: float | None,
+    track_id: int | None,
+    label: str,
+    left_handed: bool,
+) -> _Row:
+    side = -1.0 if left_handed else 1.0
+    return _Row((xyz[0], side * xyz[1], xyz[2]), size, side * yaw, score, track_id, label)
+
+
+def _from_camera(
+    xyz: tuple[float, float, float],
+    size: tuple[float, float, float],
+    rotation_y: float,
+    score: float | None,
+    track_id: int | None,
+    label: str,
+) -> _Row:
+    """Camera axes are x right, y down, z forward; the location is the middle of the box's bottom.
+
+    At rotation_y = 0 the box heads to camera x; a positive one turns it towards the camera, from x to -z. So the
+    heading is (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
+    """
+    x, y, z = xyz
+    return _Row((z, -x, -y + size[2] / 2), size, float(-rotation_y - np.pi / 2), score, track_id, label)
+
+
+def _detected_kind(code: float) -> str:
+    if code not in _DETECTED_KINDS:
+        raise ValueError(f"unknown type {code:g}, must be one of 1 (pedestrian), 2 (car), 3 (cyclist)")
+    return _DETECTED_KINDS[int(code)]
+
+
+def _track_id(word: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise ValueError(f"the track id must be an integer, got {word!r}") from None
+
+
+def _read(
+    path: str | Path, columns: int, parse: Callable[[list[str]], _Row | None], frame_count: int | None
+) -> list[Boxes]:
+    path = Path(path)
+    frames: dict[int, list[_Row]] = {}
+    first_line: dict[tuple[int, int], int] = {}
+    last = -1
+    for number, words in _lines(path):
+        frame = _frame(path, number, words)
+        last = max(last, frame)
+        try:
+            if frame_count is not None and frame >= frame_count:
+                raise ValueError(f"frame {frame}, but there are {frame_count} frames")
+            if len(words) != columns:
+                raise ValueError(f"expected {columns} values, got {len(words)}")
+            row = parse(words)
+            if row is None:
+                continue
+            if min(row.size[:2]) <= 0 or row.size[2] < 0:
+                raise ValueError(f"length and width must be > 0 and height >= 0, got {row.size}")
+            if row.track_id is not None:
+                first = first_line.setdefault((frame, row.track_id), number)
+                if first != number:
+                    raise ValueError(f"track {row.track_id} is in frame {frame} already, line {first}")
+        except ValueError as error:
+            raise ValueError(f"{path}:{number}: {error}") from None
+        frames.setdefault(frame, []).append(row)
+    return [_boxes(frames.get(frame, [])) for frame in range(last + 1 if frame_count is None else frame_count)]
+
+
+def _boxes(rows: list[_Row]) -> Boxes:
+    if not rows:
+        return Boxes.empty()
+    return Boxes(
+        center=[row.center for row in rows],
+        size=[row.size for row in rows],
+        yaw=[row.yaw for row in rows],
+        score=None if rows[0].score is None else [row.score for row in rows],
+        track_id=None if rows[0].track_id is None else [row.track_id for row in rows],
+        label=[row.label for row in rows],
+    )
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Number, from 1, and words of the lines that are not blank; separated by commas or by spaces."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is not there") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file: {error}") from None
+    return [(n, line.replace(",", " ").split()) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
+
+
+def _frame(path: Path, number: int, words: list[str]) -> int:
+    if not words or not words[0].isascii() or not words[0].isdigit():
+        raise ValueError(f"{path}:{number}: a line starts with a frame number, not {words[:1]}")
+    return int(words[0])
+
+
+def _floats(words: list[str]) -> list[float]:
+    values = [float(word) for word in words]
+    if not np.isfinite(values).all():
+        raise ValueError(f"not finite: {' '.join(words)}")
+    return values
