@@ -281,8 +281,8 @@ POSE = st.tuples(*[COORDINATE] * 3, st.floats(-10, 10), st.floats(-180, 180), st
 def test_what_is_written_is_read_again(
     tmp_path_factory: pytest.TempPathFactory, rows: list[Any], pose: tuple[float, ...]
 ) -> None:
-    centers, sizes, yaws, ids = zip(*rows, strict=True) if rows else ([], [], [], [])
-    objects = Boxes(centers, sizes, yaws, track_id=ids, label=["van"] * len(rows))
+    centers, sizes, yaws, numbers = zip(*rows, strict=True) if rows else ([], [], [], [])
+    objects = Boxes(centers, sizes, yaws, track_id=numbers, label=["van"] * len(rows))
     world_SE3_lidar = SE3_from_carla(pose)
     root = tmp_path_factory.mktemp("opv2v")
     points = np.array([[1.5, -2.25, 0.5, 51 / 255]], dtype=np.float32)

@@ -7,11 +7,10 @@ file plus one, and `count_frames` gives that over several files.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.v2v4real import LEFT_HANDED
@@ -180,7 +179,7 @@ def _from_camera(
     heading is (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
     """
     x, y, z = xyz
-    return _Row((z, -x, -y + size[2] / 2), size, float(-rotation_y - np.pi / 2), score, track_id, label)
+    return _Row((z, -x, -y + size[2] / 2), size, -rotation_y - math.pi / 2, score, track_id, label)
 
 
 def _detected_kind(code: float) -> str:
@@ -258,6 +257,6 @@ def _frame(path: Path, number: int, words: list[str]) -> int:
 
 def _floats(words: list[str]) -> list[float]:
     values = [float(word) for word in words]
-    if not np.isfinite(values).all():
+    if not all(map(math.isfinite, values)):
         raise ValueError(f"not finite: {' '.join(words)}")
     return values

@@ -1,0 +1,20 @@
+"""The registry, and that importing it stays cheap."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from cobevglue.datasets import DAIRV2X, DATASETS, OPV2V, V2V4Real, V2XSet
+
+
+def test_the_names_that_users_type() -> None:
+    assert {"opv2v": OPV2V, "v2xset": V2XSet, "v2v4real": V2V4Real, "dair-v2x": DAIRV2X} == DATASETS
+
+
+def test_importing_the_readers_loads_neither_torch_nor_what_reads_clouds() -> None:
+    script = (
+        "import sys, cobevglue.datasets; print([m for m in ('torch', 'pypcd4', 'scipy', 'numba') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert out.stdout.strip() == "[]"
