@@ -298,6 +298,11 @@ def test_frames_travel_to_worker_processes(root: Path) -> None:
         ("vehicle-side/label/lidar/015438.json", lambda c: c.append(3), "must be a list of objects"),
         ("vehicle-side/calib/lidar_to_novatel/015438.json", lambda c: c["transform"].pop("rotation"), "no rotation"),
         (
+            "vehicle-side/calib/lidar_to_novatel/015438.json",
+            lambda c: c.update(transform=[1]),
+            "must have rotation and",
+        ),
+        (
             "vehicle-side/calib/novatel_to_world/015438.json",
             lambda c: c.update(translation=[[1], [2]]),
             "translation must",

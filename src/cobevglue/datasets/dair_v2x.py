@@ -212,7 +212,9 @@ def _infrastructure(side: Path, pair: _Pair, labels: Path, classes: Collection[s
 def _calibration(path: Path) -> FloatArray:
     """(4, 4) transform in a calibration file, which has rotation and translation at the top or under `transform`."""
     content = _read_json(path)
-    content = content.get("transform", content) if isinstance(content, Mapping) else {}
+    content = content.get("transform", content) if isinstance(content, Mapping) else None
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{path}: must have rotation and translation")
     matrix = np.eye(4)
     matrix[:3, :3] = _array(path, content, "rotation", (3, 3))
     matrix[:3, 3] = _array(path, content, "translation", (3,))

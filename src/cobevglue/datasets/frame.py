@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import overload
 
 import numpy as np
@@ -157,6 +158,10 @@ class Dataset(ABC):
     """
 
     scenarios: tuple[str, ...]
+
+    @abstractmethod
+    def __init__(self, root: str | Path, split: str) -> None:
+        """Look at which scenarios the split of this name has, in the data set kept at `root`."""
 
     def __getitem__(self, name: str) -> Scenario:
         """The scenario of this name.

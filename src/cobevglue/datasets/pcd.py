@@ -37,12 +37,14 @@ def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0
     if missing:
         raise ValueError(f"{path}: no field {missing[0]!r} among the fields {', '.join(names)}")
     points = np.zeros((len(data), 4), dtype=np.float32)
-    for column, name in enumerate(("x", "y", "z")):
-        points[:, column] = data[name]
+    with np.errstate(over="ignore", invalid="ignore"):  # of doubles beyond single precision; they are left out below
+        for column, name in enumerate(("x", "y", "z")):
+            points[:, column] = data[name]
     if left_handed:
         points[:, 1] *= -1.0
     if "intensity" in names:
-        points[:, 3] = np.clip(data["intensity"].astype(np.float64) * intensity_scale, 0.0, 1.0)
+        with np.errstate(invalid="ignore"):
+            points[:, 3] = np.clip(data["intensity"].astype(np.float64) * intensity_scale, 0.0, 1.0)
     elif "rgb" in names:
         if data.dtype["rgb"].itemsize != 4:
             raise ValueError(f"{path}: the field 'rgb' must have 4 bytes, got {data.dtype['rgb'].itemsize}")

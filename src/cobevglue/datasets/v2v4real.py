@@ -58,7 +58,7 @@ class V2V4Real(YamlTree):
         return partial(read_v2v4real_labels_yaml, agent=agent, left_handed=self.left_handed)
 
     def _read_points(self, path: Path) -> Float32Array:
-        # The release has the intensity in `rgb` like OPV2V; a field `intensity` would be the sensor's own 0 to 255.
+        # In `rgb` the intensity is as in OPV2V; a field `intensity` is taken as the sensor's own 0 to 255.
         return read_pcd(path, left_handed=self.left_handed, intensity_scale=1.0 / 255.0)
 
 
@@ -90,7 +90,7 @@ def read_v2v4real_labels_yaml(path: Path, agent: str, left_handed: bool = LEFT_H
     try:
         ids = _common_ids(table.ids, [entry.get("ass_id", -1) for entry in table.entries], int(agent))
         boxes = Boxes(center=center, size=table.size, yaw=yaw, track_id=ids, label=table.kinds)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: vehicles: {error}") from None
     return world_SE3_lidar, boxes
 

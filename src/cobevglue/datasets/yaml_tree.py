@@ -163,10 +163,9 @@ def read_objects(path: Path, skip_kinds: Collection[str] = ()) -> tuple[ArrayLik
 
 
 def _object_id(where: str, key: Any) -> int:
-    try:
+    if isinstance(key, int) or (isinstance(key, str) and key.lstrip("-").isdecimal()):
         return int(key)
-    except (TypeError, ValueError):
-        raise ValueError(f"{where}: an object id must be an integer") from None
+    raise ValueError(f"{where}: an object id must be an integer")
 
 
 def _triple(where: str, entry: Mapping[str, Any], field: str) -> FloatArray:
