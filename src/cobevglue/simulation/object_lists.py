@@ -1,0 +1,162 @@
+"""A seeded junction as the object lists that several agents would detect, with the truth beside them.
+
+    for frame in Junction(seed=1):
+        ego, other = frame.agents["car1"], frame.agents["car2"]
+        ego.boxes, other.boxes                  # what each detected, in its own LiDAR frame
+        frame.ego_SE2_other("car1", "car2")     # what an aligner should find
+        frame.matches("car1", "car2")           # the rows that are the same vehicle
+
+There is no LiDAR here: boxes come from the true ones by line of sight and a detector's error model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from cobevglue.boxes import Boxes
+from cobevglue.disturbance.detection_errors import DetectionErrors, add_detection_errors
+from cobevglue.se2 import SE2
+from cobevglue.simulation.scripted_traffic import place_traffic
+from cobevglue.simulation.visibility import is_visible
+from cobevglue.typing import IntArray
+
+__all__ = ["AgentView", "Junction", "JunctionSettings", "ObjectListFrame"]
+
+_TRAFFIC_STREAM = 0
+_FIRST_DETECTION_STREAM = 1  # and one stream more for each agent after the first
+
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class JunctionSettings(BaseModel):
+    """What the junction is like.
+
+    Attributes:
+        agents: how many agents, 1 to 8; they are called car1, car2, … and start on different arms.
+        vehicles: how many vehicles, agents included.
+        duration: how long the scene lasts [s].
+        rate: frames a second [Hz].
+        sensor_range: agents see objects whose centre is at most this far away [m].
+        min_visible: an object is seen if at least this part of its angular width is not hidden behind others.
+        errors: what the detectors do wrong; `DetectionErrors.none()` for perfect ones.
+
+    Raises:
+        ValueError: a value out of its range, an unknown field, or fewer vehicles than agents.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    agents: Annotated[int, Field(ge=1, le=8)] = 2
+    vehicles: Annotated[int, Field(ge=1)] = 32
+    duration: _Positive = 8.0
+    rate: _Positive = 10.0
+    sensor_range: _Positive = 70.0
+    min_visible: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    errors: DetectionErrors = DetectionErrors()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AgentView:
+    """What one agent detected at one time, and the truth about it.
+
+    Attributes:
+        boxes: the detections with scores and labels, without track ids, in the agent's own LiDAR frame.
+        object_id: (M,) the true object of each detection, -1 for a false one.
+        visible: the true boxes of all objects that the agent could see, in its LiDAR frame; track_id is the object id.
+        world_SE2_agent: where the agent is.
+        own_id: the agent's object id: it does not see itself, but others see it.
+    """
+
+    boxes: Boxes
+    object_id: IntArray
+    visible: Boxes
+    world_SE2_agent: SE2  # noqa: N815
+    own_id: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObjectListFrame:
+    """One time step.
+
+    Attributes:
+        index: 0, 1, 2, …
+        time: time stamp [s].
+        agents: what each agent saw, by its name.
+        objects: the true boxes of all vehicles in the world frame; track_id is the object id.
+    """
+
+    index: int
+    time: float
+    agents: dict[str, AgentView]
+    objects: Boxes
+
+    def ego_SE2_other(self, ego: str, other: str) -> SE2:
+        """The true relative pose of two agents: maps the other's coordinates to the ego's."""
+        return self.agents[ego].world_SE2_agent.inverse() @ self.agents[other].world_SE2_agent
+
+    def matches(self, ego: str, other: str) -> IntArray:
+        """(K, 2) rows in the ego's and in the other's detections that are the same object, by the ego's row."""
+        mine, theirs = self.agents[ego].object_id, self.agents[other].object_id
+        same = (mine[:, None] == theirs[None, :]) & (mine >= 0)[:, None]
+        return np.argwhere(same).astype(np.int64)
+
+
+class Junction:
+    """The scene: a sequence of `ObjectListFrame`.
+
+    Same seed and settings, same bytes, in whatever order frames are asked for.
+
+    Attributes:
+        seed: a whole number >= 0.
+        settings: what the junction is like.
+        traffic: the vehicles and their paths.
+
+    Raises:
+        ValueError: the junction has no room for that many vehicles, or there are fewer vehicles than agents.
+    """
+
+    def __init__(self, seed: int = 0, settings: JunctionSettings | None = None) -> None:
+        self.seed = seed
+        self.settings = settings = settings or JunctionSettings()
+        if settings.vehicles < settings.agents:
+            raise ValueError(f"vehicles ({settings.vehicles}) must be at least agents ({settings.agents})")
+        rng = np.random.default_rng([seed, _TRAFFIC_STREAM, 0])
+        self.traffic = place_traffic(settings.vehicles, settings.agents, settings.duration, rng)
+
+    def __len__(self) -> int:
+        """How many frames the scene has."""
+        return max(1, round(self.settings.duration * self.settings.rate))
+
+    def __iter__(self) -> Iterator[ObjectListFrame]:
+        """The frames in order."""
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> ObjectListFrame:
+        """The frame with this index, from 0.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"frame {index} of a scene of {len(self)}")
+        index %= len(self)
+        time = index / self.settings.rate
+        objects = self.traffic.at(time)
+        agents = {f"car{i + 1}": self._view(objects, i, index) for i in range(self.settings.agents)}
+        return ObjectListFrame(index=index, time=time, agents=agents, objects=objects)
+
+    def _view(self, objects: Boxes, agent: int, index: int) -> AgentView:
+        """What the agent with this object id sees of `objects` (given in the world frame)."""
+        world_SE2_agent = SE2(objects.center[agent, 0], objects.center[agent, 1], objects.yaw[agent])
+        others = objects[np.arange(len(objects)) != agent].transform(world_SE2_agent.inverse())
+        visible = others[is_visible(others, self.settings.sensor_range, self.settings.min_visible)]
+        rng = np.random.default_rng([self.seed, _FIRST_DETECTION_STREAM + agent, index])
+        boxes, rows = add_detection_errors(visible, self.settings.errors, rng)
+        assert visible.track_id is not None
+        known = np.append(visible.track_id, -1)  # row -1, a false box, is object -1
+        return AgentView(boxes, known[rows], visible, world_SE2_agent, agent)

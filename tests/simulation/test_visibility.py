@@ -1,0 +1,68 @@
+"""Line of sight in the plane, on scenes that can be checked by eye. The sensor is at the origin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cobevglue.boxes import Boxes
+from cobevglue.simulation.visibility import is_visible, visible_fraction
+
+
+def boxes(*rows: tuple[float, float, float, float, float]) -> Boxes:
+    """Boxes of x, y, length, width, yaw."""
+    table = np.array(rows).reshape(-1, 5)
+    return Boxes(
+        center=np.column_stack([table[:, :2], np.zeros(len(table))]),
+        size=np.column_stack([table[:, 2:4], np.ones(len(table))]),
+        yaw=table[:, 4],
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected", "why"),
+    [
+        ([(10, 0, 2, 2, 0)], [1.0], "one box alone is seen whole"),
+        ([(10, 0, 2, 2, 0), (20, 0, 2, 2, 0)], [1.0, 0.0], "one of the same size right behind it is hidden"),
+        ([(20, 0, 2, 2, 0), (10, 0, 2, 2, 0)], [0.0, 1.0], "in whatever order they come"),
+        ([(10, 0, 2, 2, 0), (0, 20, 2, 2, 0)], [1.0, 1.0], "one in another direction is not"),
+        ([(10, 0, 2, 2, 0), (-20, 0, 2, 2, 0)], [1.0, 1.0], "nor one on the other side of the sensor"),
+        ([(10, 0, 2, 2, 0), (20, 0, 2, 40, 0)], [1.0, 7 / 9], "a wall behind it looks out on both sides"),
+        ([(10, 5, 2, 10, 0), (21, 0, 2, 4, 0)], [1.0, 4 / 9], "half of it is hidden by a wall that ends at the middle"),
+        ([(-10, 0, 2, 2, 0), (-20, 0, 2, 2, 0)], [1.0, 0.0], "bearings around +-180 degrees are no exception"),
+        ([(10, 0, 0.1, 8, np.pi / 2), (20, 0, 2, 2, 0)], [1.0, 7 / 9], "a thin one seen from its end hides little"),
+        ([], [], "no boxes"),
+    ],
+)
+def test_what_is_not_covered_by_another_box(rows: list[tuple[float, ...]], expected: list[float], why: str) -> None:
+    fractions = visible_fraction(boxes(*rows))  # type: ignore[arg-type]
+    np.testing.assert_allclose(fractions, expected, atol=0.12, err_msg=why)  # nine rays: one may go either way
+
+
+def test_range_counts_from_the_origin_to_the_centre() -> None:
+    seen = is_visible(boxes((30, 0, 4, 2, 0), (0, 50.1, 4, 2, 0), (-30, -39.9, 4, 2, 0)), 50.0, 0.5)
+    assert seen.tolist() == [True, False, True]
+
+
+def test_what_counts_as_hidden_can_be_chosen() -> None:
+    scene = boxes((10, 5, 2, 10, 0), (21, 0, 2, 4, 0))
+    assert is_visible(scene, 50.0, 0.3).tolist() == [True, True]
+    assert is_visible(scene, 50.0, 0.8).tolist() == [True, False]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(5, 60), st.floats(-60, 60), st.floats(1, 12), st.floats(1, 3), st.floats(-3, 3)),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_the_nearest_box_is_never_wholly_hidden_and_a_box_never_gets_more_visible_by_company(
+    rows: list[tuple[float, float, float, float, float]],
+) -> None:
+    fractions = visible_fraction(boxes(*rows))
+    assert fractions.max() > 0
+    fewer = visible_fraction(boxes(*rows[:-1]))
+    assert (fractions[:-1] <= fewer + 1e-12).all()
