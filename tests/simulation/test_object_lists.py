@@ -142,6 +142,7 @@ def test_frames_can_be_counted_from_the_end_and_not_beyond() -> None:
     [
         ({"agents": 0}, "agents"),
         ({"agents": 9}, "agents"),
+        ({"vehicles": 101}, "vehicles"),
         ({"duration": 0.0}, "duration"),
         ({"rate": -1.0}, "rate"),
         ({"min_visible": 1.5}, "min_visible"),

@@ -38,7 +38,7 @@ class JunctionSettings(BaseModel):
 
     Attributes:
         agents: how many agents, 1 to 8; they are called car1, car2, … and start on different arms.
-        vehicles: how many vehicles, agents included.
+        vehicles: how many vehicles, agents included, 1 to 100.
         duration: how long the scene lasts [s].
         rate: frames a second [Hz].
         sensor_range: agents see objects whose centre is at most this far away [m].
@@ -52,7 +52,7 @@ class JunctionSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     agents: Annotated[int, Field(ge=1, le=8)] = 2
-    vehicles: Annotated[int, Field(ge=1)] = 32
+    vehicles: Annotated[int, Field(ge=1, le=100)] = 32
     duration: _Positive = 8.0
     rate: _Positive = 10.0
     sensor_range: _Positive = 70.0
