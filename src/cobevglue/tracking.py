@@ -1,0 +1,405 @@
+"""A SORT-style multi-object tracker in bird's-eye view, for boxes seen from a vehicle whose own motion is unknown.
+
+After Bewley et al., "Simple Online and Realtime Tracking" (ICIP 2016): a constant-velocity Kalman filter for each track
+and the Hungarian method to associate. Three things differ, because no localisation is at hand and identities are what
+we are after:
+
+- The frame moves. A parked car comes towards a vehicle at 20 m/s by 2 m a frame, and in a bend the far ones faster, so
+  the motion that most tracks share is taken for the frame's own: it is fitted to the associations of each frame and
+  predicts all tracks in the next one, new ones included. A track's velocity is what remains: its own.
+- Every detection gets an identity at once. Identities are hints to the object matching, which wants them early and pure
+  (one identity, one object) rather than long.
+- Headings may be flipped: a detector that mistakes front and back neither breaks a track nor turns it.
+
+Importing this module imports neither torch nor numba.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+from pydantic import BaseModel, ConfigDict, Field
+
+from cobevglue.boxes import Boxes
+from cobevglue.se2 import SE2, wrap_angle
+from cobevglue.typing import BoolArray, FloatArray, IntArray
+
+__all__ = ["Sort", "SortConfig", "Tracks"]
+
+_ComplexArray = npt.NDArray[np.complex128]
+"""Vectors of the plane, x + iy: turning one is a multiplication."""
+
+_NONE = np.zeros(0, dtype=np.int64)
+_SAME_TIME = 1e-6
+"""Slack of `max_age` [s]: a clock that counts tenths of seconds counts in no binary fractions."""
+_UNKNOWN = 1.0
+"""Beyond this uncertainty [m] of where the frame has moved to, the motion is looked for and not only refined."""
+_CELL, _CELLS = 0.5, 10
+"""Size of a cell [m] and half the number of them along each side, in that search: motions up to 5 m a frame."""
+_SAME_PLACE = 0.2
+"""Predictions that move by less [m] when the frame's motion is corrected need no other association."""
+_ROUNDS = 4
+"""Most rounds of associating and correcting the frame's motion in an update; one is the rule."""
+_HEADING_GAIN, _SHAPE_GAIN, _FRONT_GAIN = 0.5, 0.3, 0.2
+"""Shares of a new detection in a track's heading, its size and height, and the vote on which end is the front."""
+
+
+class SortConfig(BaseModel):
+    """Settings of `Sort`. The paper gives none: these are ours, measured by `benchmarks/tracking.py`.
+
+    Attributes:
+        affinity: what associates a detection with a predicted track: `distance` between centres, or `giou`.
+        max_distance: a detection further from the predicted centre is another object [m].
+        min_giou: a detection with a smaller generalised IoU is another object (with `giou` only).
+        max_age: how long a track may go unseen, and how long a gap in the input may be, before it ends [s].
+        period: time between updates that come without a time [s].
+        position_noise: standard deviation of a detected centre on each axis [m].
+        acceleration_noise: standard deviation of an object's acceleration on each axis [m/s^2].
+        velocity_prior: standard deviation of a new object's own velocity on each axis [m/s].
+        frame_motion: estimate the frame's own motion; switch it off where the frame stands still.
+        frame_speed_prior: standard deviation of the frame's velocity at the start [m/s].
+        frame_turn_prior: standard deviation of the frame's turn rate at the start [rad/s].
+        frame_acceleration_noise: how fast the frame's velocity may change [m/s^2].
+        frame_turn_noise: how fast the frame's turn rate may change [rad/s^2].
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    affinity: Literal["distance", "giou"] = "distance"
+    max_distance: float = Field(default=4.5, gt=0, allow_inf_nan=False)
+    min_giou: float = Field(default=-0.4, ge=-1, le=1)
+    max_age: float = Field(default=0.3, gt=0, allow_inf_nan=False)
+    period: float = Field(default=0.1, gt=0, allow_inf_nan=False)
+    position_noise: float = Field(default=0.3, gt=0, allow_inf_nan=False)
+    acceleration_noise: float = Field(default=4.0, gt=0, allow_inf_nan=False)
+    velocity_prior: float = Field(default=10.0, gt=0, allow_inf_nan=False)
+    frame_motion: bool = True
+    frame_speed_prior: float = Field(default=20.0, gt=0, allow_inf_nan=False)
+    frame_turn_prior: float = Field(default=0.5, gt=0, allow_inf_nan=False)
+    frame_acceleration_noise: float = Field(default=8.0, gt=0, allow_inf_nan=False)
+    frame_turn_noise: float = Field(default=1.2, gt=0, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """What a tracker believes of its N living tracks, also of those it has not seen just now.
+
+    Attributes:
+        boxes: N boxes in the agent's frame: filtered centre and heading, smoothed size, `track_id`.
+        velocity: (N, 2) velocity along the frame's axes [m/s], over ground as far as the frame's motion was told right:
+            where all objects move alike, theirs is taken for the frame's.
+        unseen: (N,) time since the last detection [s].
+    """
+
+    boxes: Boxes
+    velocity: FloatArray
+    unseen: FloatArray
+
+
+class Sort:
+    """Gives the boxes of successive frames identities that last. One tracker per agent.
+
+        tracker = Sort()
+        for boxes in frames:
+            tracked = tracker.update(boxes)  # the same boxes, with track_id
+
+    The same input gives the same identities, and none is given twice in a tracker's life, not even after `reset`.
+
+    Args:
+        config: settings; the defaults are for vehicles at 10 Hz.
+    """
+
+    def __init__(self, config: SortConfig | None = None) -> None:
+        self.config = config or SortConfig()
+        self._next_id = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all tracks, the frame's motion and the time. Identities go on counting."""
+        self._time: float | None = None
+        self._tracks = _State()
+        self._frame = _FrameMotion(self.config)
+
+    def update(self, boxes: Boxes, time: float | None = None) -> Boxes:
+        """Identities for the boxes of the next frame.
+
+        The boxes come back as they are, every one and in the same order: detections, not filtered states. What the
+        filter makes of them is in `tracks`.
+
+        Args:
+            boxes: N detections in the agent's frame; scores, labels and any `track_id` play no part.
+            time: when they were seen [s], on any clock; by default `config.period` after the last update. After a gap
+                longer than `config.max_age` all tracks are new.
+
+        Returns:
+            The N boxes with `track_id`.
+
+        Raises:
+            ValueError: `time` is not finite or not later than the last one; the tracker is then as it was.
+        """
+        time, dt = self._advance(time)
+        self._end_lost_tracks(time)
+        self._predict(dt)
+        rows, columns = self._associate(boxes, dt)
+        self._correct(rows, boxes, columns, time)
+        ids = self._begin_new_tracks(rows, boxes, columns, time)
+        return boxes.replace(track_id=ids)
+
+    @property
+    def tracks(self) -> Tracks:
+        """The living tracks as filtered up to the last update."""
+        s = self._tracks
+        center = np.column_stack([s.position.real, s.position.imag, s.shape[:, 3]])
+        boxes = Boxes(center, s.shape[:, :3], wrap_angle(s.yaw), track_id=s.id)
+        return Tracks(boxes, np.column_stack([s.velocity.real, s.velocity.imag]), (self._time or 0.0) - s.seen)
+
+    @property
+    def now_SE2_before(self) -> SE2:
+        """The frame's own motion over the last step: where a point at rest, given as seen before, is seen now."""
+        return SE2(self._frame.shift.real, self._frame.shift.imag, self._frame.yaw)
+
+    def _advance(self, time: float | None) -> tuple[float, float]:
+        """The time of this update and the step since the last one [s]."""
+        if time is None:
+            time = 0.0 if self._time is None else self._time + self.config.period
+        time = float(time)
+        if not math.isfinite(time) or (self._time is not None and time <= self._time):
+            raise ValueError(f"time must be finite and later than the last update's {self._time}, got {time}")
+        dt = self.config.period if self._time is None else time - self._time
+        self._time = time
+        return time, dt
+
+    def _end_lost_tracks(self, time: float) -> None:
+        """Death: unseen for too long."""
+        alive = time - self._tracks.seen <= self.config.max_age + _SAME_TIME
+        if not alive.all():
+            self._tracks.keep(alive)
+
+    def _predict(self, dt: float) -> None:
+        """Each object goes on at its own velocity, by random accelerations more or less."""
+        s, q = self._tracks, self.config.acceleration_noise**2
+        s.position = s.position + dt * s.velocity
+        position, mixed, velocity = s.variance
+        s.variance = np.array(
+            [
+                position + dt * (2.0 * mixed + dt * velocity) + 0.25 * q * dt**4,
+                mixed + dt * velocity + 0.5 * q * dt**3,
+                velocity + q * dt**2,
+            ]
+        )
+
+    def _associate(self, boxes: Boxes, dt: float) -> tuple[IntArray, IntArray]:
+        """Rows of tracks and rows of boxes that belong together; leaves the tracks in the frame of now.
+
+        The frame is first taken to go on moving as it did. The associations that this gives tell how it did move, and
+        where that changes the prediction, they are made once more.
+        """
+        s, frame, detected = self._tracks, self._frame, _plane(boxes)
+        frame.predict(dt)
+        if self.config.frame_motion and frame.shift_std > _UNKNOWN:
+            frame.acquire(s.position, detected)
+        rows, columns, at = _NONE, _NONE, frame.apply(s.position)
+        for _ in range(_ROUNDS if len(s) and len(boxes) else 0):
+            rows, columns = self._assign(at, boxes)
+            if not self.config.frame_motion or not len(rows):
+                break
+            variance = s.variance[0, rows] + self.config.position_noise**2
+            frame.correct(s.position[rows], detected[columns], variance)
+            before, at = at, frame.apply(s.position)
+            if np.abs(at - before).max() < _SAME_PLACE:
+                break
+        s.position, s.velocity, s.yaw = at, frame.turn(s.velocity), s.yaw + frame.yaw
+        return rows, columns
+
+    def _assign(self, at: _ComplexArray, boxes: Boxes) -> tuple[IntArray, IntArray]:
+        """The cheapest one-to-one assignment of tracks, predicted `at` (N,), to boxes, within the gate.
+
+        No pair costs more than the gate: a good pair is never given up so that a bad one fits in as well.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        if self.config.affinity == "giou":
+            from cobevglue._iou_kernels import giou_matrix
+
+            s = self._tracks
+            predicted = np.column_stack([at.real, at.imag, s.shape[:, :2], s.yaw + self._frame.yaw])
+            cost = 1.0 - giou_matrix(predicted, boxes.bev, self.config.max_distance)
+            gate = 1.0 - self.config.min_giou
+        else:
+            offset = at[:, None] - _plane(boxes)
+            cost = offset.real**2 + offset.imag**2
+            gate = self.config.max_distance**2
+        rows, columns = linear_sum_assignment(np.minimum(cost, gate))
+        inside = cost[rows, columns] < gate
+        return rows[inside], columns[inside]
+
+    def _correct(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float) -> None:
+        """The Kalman update of the associated tracks; heading and shape by a share of what is new in the detection."""
+        s = self._tracks
+        position, mixed, velocity = s.variance[:, rows]
+        gain = position / (position + self.config.position_noise**2)
+        velocity_gain = mixed / (position + self.config.position_noise**2)
+        innovation = _plane(boxes)[columns] - s.position[rows]
+        s.position[rows] += gain * innovation
+        s.velocity[rows] += velocity_gain * innovation
+        s.variance[:, rows] = (1.0 - gain) * position, (1.0 - gain) * mixed, velocity - velocity_gain * mixed
+        s.shape[rows] += _SHAPE_GAIN * (_shape(boxes)[columns] - s.shape[rows])
+        s.seen[rows] = time
+
+        yaw = s.yaw[rows]
+        turn = boxes.yaw[columns] - yaw
+        half_turns = np.round(turn / np.pi)
+        front = s.front[rows]
+        front += _FRONT_GAIN * (1.0 - 2.0 * (half_turns % 2.0) - front)
+        # Brought within 90 degrees, a flipped detection turns nothing; if most are flipped, the track itself was.
+        s.yaw[rows] = yaw + _HEADING_GAIN * (turn - np.pi * half_turns) + np.pi * (front < 0.0)
+        s.front[rows] = np.abs(front)
+
+    def _begin_new_tracks(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float) -> IntArray:
+        """Birth: a new identity for each box that continues no track. Returns the identities of all boxes (N,)."""
+        ids = np.full(len(boxes), -1, dtype=np.int64)
+        ids[columns] = self._tracks.id[rows]
+        new = np.flatnonzero(ids < 0)
+        if len(new):
+            ids[new] = np.arange(self._next_id, self._next_id + len(new))
+            self._next_id += len(new)
+            self._tracks.append(ids[new], boxes, new, time, self.config)
+        return ids
+
+
+class _FrameMotion:
+    """How a frame without localisation moves, told from what most things in it do: a Kalman filter on its twist.
+
+    Attributes:
+        shift: translation of now_SE2_before, where a point at rest seen before is seen now, as x + iy [m].
+        yaw: its rotation [rad].
+    """
+
+    def __init__(self, config: SortConfig) -> None:
+        self._set(np.zeros(3))
+        self._moves = config.frame_motion
+        self._noise = np.diag([config.frame_acceleration_noise] * 2 + [config.frame_turn_noise]) ** 2
+        self._twist = np.zeros(3)  # [m/s, m/s, rad/s]
+        self._covariance = np.diag([config.frame_speed_prior] * 2 + [config.frame_turn_prior]) ** 2
+        self._expected, self._information, self._dt = np.zeros(3), np.eye(3), config.period
+
+    def predict(self, dt: float) -> None:
+        """The frame goes on as it did, by random accelerations more or less."""
+        if self._moves:
+            self._covariance = self._covariance + dt**2 * self._noise
+            self._expected, self._information, self._dt = dt * self._twist, np.linalg.inv(self._covariance) / dt**2, dt
+            self._set(self._expected)
+
+    @property
+    def shift_std(self) -> float:
+        """Standard deviation of the predicted translation along x [m]."""
+        return float(self._dt * math.sqrt(self._covariance[0, 0]))
+
+    def acquire(self, before: _ComplexArray, now: _ComplexArray) -> None:
+        """Look for the translation that most pairs of a point `before` and one `now` have in common.
+
+        In a row of cars the nearest is often the neighbour. All pairs vote in a grid, and the densest 3 x 3 cells win,
+        the ones nearest to the expected motion if there are several.
+        """
+        offset = (now[None, :] - self.apply(before)[:, None]).ravel()
+        cell = np.rint(np.column_stack([offset.real, offset.imag]) / _CELL).astype(np.int64)
+        inside = (np.abs(cell) <= _CELLS).all(axis=1)
+        if not inside.any():
+            return
+        offset, cell = offset[inside], cell[inside] + _CELLS + 1
+        side = 2 * _CELLS + 1
+        votes = np.zeros((side + 2, side + 2))
+        np.add.at(votes, (cell[:, 0], cell[:, 1]), 1.0)
+        dense = sliding_window_view(votes, (3, 3)).sum(axis=(2, 3))
+        far = np.hypot(*np.mgrid[-_CELLS : _CELLS + 1, -_CELLS : _CELLS + 1])
+        peak = np.array(divmod(int(np.argmax(dense - 1e-3 * far)), side)) + 1
+        shift = offset[(np.abs(cell - peak) <= 1).all(axis=1)].mean()
+        self._set(self._motion + [shift.real, shift.imag, 0.0])
+
+    def correct(self, before: _ComplexArray, now: _ComplexArray, variance: FloatArray) -> None:
+        """Fit the motion to points predicted `before`, in the frame of then, and seen `now`; all (N,).
+
+        One step of Gauss-Newton from the best motion so far, with each point's weight lowered by its own error
+        (Cauchy's loss), so that what moves otherwise or is associated wrongly does not pull.
+        """
+        turned = self.turn(before)
+        error = now - turned - self.shift
+        weight = 1.0 / (variance + error.real**2 + error.imag**2)
+        # A turn by d moves a point by i * d * turned.
+        total, lever, pull = weight.sum(), 1j * (weight @ turned), weight @ error
+        inertia, torque = (weight @ (turned * turned.conj())).real, (weight @ (turned.conj() * error)).imag
+        hessian = [[total, 0.0, lever.real], [0.0, total, lever.imag], [lever.real, lever.imag, inertia]]
+        covariance = np.linalg.inv(self._information + hessian)
+        gradient = self._information @ (self._expected - self._motion) + [pull.real, pull.imag, torque]
+        self._set(self._motion + covariance @ gradient)
+        self._twist, self._covariance = self._motion / self._dt, covariance / self._dt**2
+
+    def apply(self, points: _ComplexArray) -> _ComplexArray:
+        """Points at rest (N,), as seen before, as they are seen now."""
+        return self.turn(points) + self.shift
+
+    def turn(self, vectors: _ComplexArray) -> _ComplexArray:
+        """Vectors (N,) along the axes of before, along those of now."""
+        turned: _ComplexArray = vectors * cmath.rect(1.0, self.yaw)
+        return turned
+
+    def _set(self, motion: FloatArray) -> None:
+        self._motion = motion
+        self.shift, self.yaw = complex(motion[0], motion[1]), float(motion[2])
+
+
+class _State:
+    """The state of N tracks in the agent's frame.
+
+    Noise is the same in every direction, so one 2 x 2 covariance of position and velocity serves both axes, and turning
+    the frame leaves it as it is.
+    """
+
+    def __init__(self) -> None:
+        self.id = _NONE
+        self.position: _ComplexArray = np.zeros(0, dtype=np.complex128)  # (N,) [m]
+        self.velocity: _ComplexArray = np.zeros(0, dtype=np.complex128)  # (N,) the object's own [m/s]
+        self.variance = np.zeros((3, 0))  # of position, of position with velocity, of velocity
+        self.shape = np.zeros((0, 4))  # length, width, height, z [m]
+        self.yaw = np.zeros(0)  # [rad]
+        self.front = np.zeros(0)  # in [0, 1]: how clearly the detections agree on which end is the front
+        self.seen = np.zeros(0)  # time of the last detection [s]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def keep(self, alive: BoolArray) -> None:
+        """Drop the other tracks."""
+        for name, values in vars(self).items():
+            setattr(self, name, values[:, alive] if name == "variance" else values[alive])
+
+    def append(self, ids: IntArray, boxes: Boxes, rows: IntArray, time: float, config: SortConfig) -> None:
+        """Add tracks of these rows of `boxes`, at rest as far as one can tell."""
+        n = len(rows)
+        prior = np.array([config.position_noise**2, 0.0, config.velocity_prior**2])
+        self.id = np.concatenate([self.id, ids])
+        self.position = np.concatenate([self.position, _plane(boxes)[rows]])
+        self.velocity = np.concatenate([self.velocity, np.zeros(n)])
+        self.variance = np.concatenate([self.variance, np.repeat(prior[:, None], n, axis=1)], axis=1)
+        self.shape = np.concatenate([self.shape, _shape(boxes)[rows]])
+        self.yaw = np.concatenate([self.yaw, boxes.yaw[rows]])
+        # One flipped detection next shall not turn the track, a second shall.
+        self.front = np.concatenate([self.front, np.full(n, 1.5 * _FRONT_GAIN)])
+        self.seen = np.concatenate([self.seen, np.full(n, time)])
+
+
+def _plane(boxes: Boxes) -> _ComplexArray:
+    """(N,) centres seen from above, x + iy [m]."""
+    centers: _ComplexArray = boxes.center[:, 0] + 1j * boxes.center[:, 1]
+    return centers
+
+
+def _shape(boxes: Boxes) -> FloatArray:
+    """(N, 4) length, width, height, z [m]."""
+    return np.column_stack([boxes.size, boxes.center[:, 2]])
