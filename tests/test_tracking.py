@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
 
 from cobevglue import SE2, Boxes
+from cobevglue.datasets.tracking_text import read_v2v4real_detections, read_v2v4real_labels
 from cobevglue.se2 import wrap_angle
 from cobevglue.tracking import Sort, SortConfig
 
@@ -54,6 +56,7 @@ def bend(speed: float, turn_rate: float) -> Callable[[float], SE2]:
 PARKED = cars([(x, side * 8.0 + 0.3 * np.sin(7 * x)) for x in range(10, 130, 12) for side in (-1, 1)])
 ROW_OF_BAYS = cars([(2.6 * k + 5, 7.0) for k in (0, 1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 14, 15)], 90)
 
+POSTS = [(40.0, 5.0), (40.0, -5.0), (-40.0, 5.0)]
 # Each case: frames of car positions, and the identities that the cars should have, frame by frame.
 TABLE: dict[str, tuple[Sequence[Sequence[tuple[float, float]]], list[list[int]]]] = {
     "cars that stand still keep their ids": ([[(0, 0), (10, 0)]] * 3, [[0, 1]] * 3),
@@ -70,13 +73,13 @@ TABLE: dict[str, tuple[Sequence[Sequence[tuple[float, float]]], list[list[int]]]
         [[(60 - 2 * k, 0), (20, 8), (30, 8), (40, -8), (50, -8)] for k in range(30)],
         [[0, 1, 2, 3, 4]] * 30,
     ),
-    "a car missed for two frames comes back as itself": (
-        [[(k, 0), (30, 0)] for k in range(5)] + [[(30, 0)]] * 2 + [[(7, 0), (30, 0)]],
-        [[0, 1]] * 5 + [[1]] * 2 + [[0, 1]],
+    "a car missed for nine frames comes back as itself where its own motion has brought it": (
+        [[(k, 0), *POSTS] for k in range(10)] + [POSTS] * 9 + [[(19, 0), *POSTS]],
+        [[0, 1, 2, 3]] * 10 + [[1, 2, 3]] * 9 + [[0, 1, 2, 3]],
     ),
-    "a car missed for three frames, longer than max_age, is new": (
-        [[(0, 0), (30, 0)]] * 5 + [[(30, 0)]] * 3 + [[(0, 0), (30, 0)]],
-        [[0, 1]] * 5 + [[1]] * 3 + [[2, 1]],
+    "a car unseen for longer than a second is new": (
+        [[(0, 0), *POSTS]] * 5 + [POSTS] * 10 + [[(0, 0), *POSTS]],
+        [[0, 1, 2, 3]] * 5 + [[1, 2, 3]] * 10 + [[4, 1, 2, 3]],
     ),
     "a car elsewhere is another car": ([[(0, 0), (30, 0)], [(0, 9), (30, 0)]], [[0, 1], [2, 1]]),
     "a second detection of a car gets an id of its own": (
@@ -109,7 +112,7 @@ def test_everything_stands_still_and_the_agent_drives(
     scene: Boxes, pose: Callable[[float], SE2], affinity: str
 ) -> None:
     frames = drive(scene, pose)
-    config = SortConfig.model_validate({"affinity": affinity, "max_distance": 8.0 if affinity == "giou" else 4.5})
+    config = SortConfig.model_validate({"affinity": affinity})
     assert ids_of(frames, Sort(config)) == [list(range(len(scene)))] * len(frames)
 
 
@@ -204,9 +207,9 @@ def test_tracks_include_what_is_out_of_sight_just_now() -> None:
 def test_time() -> None:
     """A gap as long as max_age is bridged, a longer one starts all tracks anew; the default step is 0.1 s."""
     tracker, boxes = Sort(), cars([(0, 0), (10, 0)])
-    assert [tracker.update(boxes, time=t).track_id.tolist() for t in (1.7e9, 1.7e9 + 0.3)] == [[0, 1], [0, 1]]  # type: ignore[union-attr]
+    assert [tracker.update(boxes, time=t).track_id.tolist() for t in (1.7e9, 1.7e9 + 1.0)] == [[0, 1], [0, 1]]  # type: ignore[union-attr]
     assert ids_of([boxes], tracker) == [[0, 1]]
-    assert tracker.update(boxes, time=1.7e9 + 1.0).track_id.tolist() == [2, 3]  # type: ignore[union-attr]
+    assert tracker.update(boxes, time=1.7e9 + 2.2).track_id.tolist() == [2, 3]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("time", [0.1, 0.0, -1.0, float("nan"), float("inf")])
@@ -293,3 +296,30 @@ def test_importing_imports_neither_torch_nor_numba_nor_scipy() -> None:
     code = "import sys, cobevglue.tracking; print([m for m in ('torch', 'numba', 'scipy') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(not (DATA / "v2v4real_detections").is_dir(), reason=f"no V2V4Real detections in {DATA}")
+@pytest.mark.parametrize("agent", ["ego", "other"])
+def test_identities_last_on_real_detections(agent: str) -> None:
+    """Two real cars on V2V4Real val 0008: an object changes its id in less than 1.2 % of its detections.
+
+    benchmarks/tracking.py has the scores; the nearest neighbour changes ids twice as often.
+    """
+    folder = DATA / "v2v4real_detections" / "val"
+    detections = read_v2v4real_detections(folder / agent / "0008.txt")
+    labels = read_v2v4real_labels(folder / "labels" / "0008.txt", len(detections))
+    last: dict[int, int] = {}
+    matched = switches = 0
+    for seen, true, ids in zip(detections, labels, ids_of(detections), strict=True):
+        assert len(set(ids)) == len(seen)
+        if not len(seen) or true.track_id is None:
+            continue
+        distance = np.linalg.norm(true.center[:, None, :2] - seen.center[None, :, :2], axis=-1)
+        for row, column in zip(*linear_sum_assignment(np.minimum(distance, 2.0)), strict=True):
+            if distance[row, column] < 2.0:
+                name = int(true.track_id[row])
+                switches += last.get(name, ids[column]) != ids[column]
+                matched += 1
+                last[name] = ids[column]
+    assert matched > 3000
+    assert switches < 0.012 * matched
