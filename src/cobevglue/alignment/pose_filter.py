@@ -1,0 +1,340 @@
+"""Relative-pose hypotheses carried over time (numba kernels).
+
+A single frame with two common objects rarely has one answer; a second of frames nearly always has. So the filter
+keeps several hypotheses at once, each a relative pose with its rate of change (Kalman filter, constant velocity at
+the pivot), and the evidence it has gathered. In every frame each hypothesis looks for its common subgraph anew, from
+where motion and the surviving track pairs say it should be, and the full `search` runs beside them, so that a wrong
+lock is left as soon as another pose explains the frames better.
+
+The evidence of a hypothesis is a running mean of its stars' evidence, old frames counting less. It starts as if one
+frame without any evidence had been seen before: the first frame alone counts half.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cobevglue.alignment.evidence import NoiseModel, X, Y, size_evidence, wrap
+from cobevglue.alignment.pose_search import STAR, add_star, fit_pose, most_pairs, refine, same_pose, search
+from cobevglue.typing import FloatArray
+
+__all__ = ["HYPOTHESIS", "Motion", "NoiseModel", "advance"]
+
+_MOST_TRACK_PAIRS = 32
+"""Track pairs a hypothesis remembers."""
+_MOST_HYPOTHESES = 8
+_FORGOTTEN = 0.3
+"""A hypothesis that nothing agreed with is dropped below this evidence [nats]."""
+_SURPRISE = 2.0
+"""Mean squared innovation, in standard deviations, above which a hypothesis' covariance is inflated."""
+_STEP = 0.1
+"""Memory is configured per frame of this length [s]."""
+_SAME_DISTANCE, _SAME_ANGLE = 2.0, math.radians(8.0)
+"""Poses that agree this closely at the pivot are not rivals [m, rad]."""
+
+HYPOTHESIS = np.dtype(
+    [
+        ("ego_x", "f8"),  # the pivot in ego's frame [m] ...
+        ("ego_y", "f8"),
+        ("other_x", "f8"),  # ... and in other's
+        ("other_y", "f8"),
+        ("yaw", "f8"),
+        ("rate", "f8", (3,)),  # of ego_x, ego_y, yaw, with the pivot held still in other's frame [m/s, rad/s]
+        ("cov", "f8", (6, 6)),  # of (ego_x, ego_y, yaw, rate)
+        ("evidence", "f8"),  # running mean [nats]
+        ("frame_evidence", "f8"),  # this frame's [nats], 0 when nothing agreed
+        ("frames", "i8"),  # frames in which something agreed
+        ("pairs", "i8"),  # matched pairs in this frame
+        ("tracked_pairs", "i8"),  # how many of the last matched pairs have track ids, and those ids
+        ("ego_id", "i8", (_MOST_TRACK_PAIRS,)),
+        ("other_id", "i8", (_MOST_TRACK_PAIRS,)),
+    ],
+    align=True,
+)
+
+
+class Motion(NamedTuple):
+    """What the filter assumes of time; see `BEVGlueConfig` for meanings, units and measurements."""
+
+    acceleration: float
+    yaw_acceleration: float
+    speed_std: float
+    yaw_rate_std: float
+    correlation: float
+    memory: float
+    miss_memory: float
+    link_distance: float
+    link_angle: float
+    use_tracks: bool
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _predict(h, dt: float, motion: Motion) -> None:  # type: ignore[no-untyped-def]
+    """Constant-twist step of the Kalman filter: the velocity turns with the relative yaw.
+
+    When either agent drives a circle, so does every point of its frame in the other's.
+    """
+    cos, sin = math.cos(h.rate[2] * dt), math.sin(h.rate[2] * dt)
+    vx, vy = h.rate[0], h.rate[1]
+    h.rate[0], h.rate[1] = cos * vx - sin * vy, sin * vx + cos * vy
+    h.ego_x += 0.5 * (vx + h.rate[0]) * dt
+    h.ego_y += 0.5 * (vy + h.rate[1]) * dt
+    h.yaw = wrap(h.yaw + h.rate[2] * dt)
+    step = np.eye(6)
+    for i in range(3):
+        step[i, i + 3] = dt
+    step[0, 5], step[1, 5] = -0.5 * vy * dt * dt, 0.5 * vx * dt * dt
+    step[3, 5], step[4, 5] = -vy * dt, vx * dt
+    _congruence(h.cov, step)
+    for i in range(3):
+        q = (motion.acceleration if i < 2 else motion.yaw_acceleration) ** 2
+        h.cov[i, i] += q * dt**3 / 3.0
+        h.cov[i, i + 3] += q * dt**2 / 2.0
+        h.cov[i + 3, i] += q * dt**2 / 2.0
+        h.cov[i + 3, i + 3] += q * dt
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _congruence(cov: FloatArray, matrix: FloatArray) -> None:
+    """`cov = matrix cov matrix^T`, in place, for (6, 6)."""
+    half = np.zeros((6, 6))
+    for i in range(6):
+        for k in range(6):
+            if matrix[i, k] != 0.0:
+                for j in range(6):
+                    half[i, j] += matrix[i, k] * cov[k, j]
+    cov[:] = 0.0
+    for j in range(6):
+        for k in range(6):
+            if matrix[j, k] != 0.0:
+                for i in range(6):
+                    cov[i, j] += half[i, k] * matrix[j, k]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _move_pivot(h, other_x: float, other_y: float) -> None:  # type: ignore[no-untyped-def]
+    """Write the same pose, rate and covariance down at another point of other's frame."""
+    cos, sin = math.cos(h.yaw), math.sin(h.yaw)
+    dx, dy = other_x - h.other_x, other_y - h.other_y
+    x, y = cos * dx - sin * dy, sin * dx + cos * dy
+    h.ego_x += x
+    h.ego_y += y
+    h.other_x, h.other_y = other_x, other_y
+    h.rate[0] -= h.rate[2] * y
+    h.rate[1] += h.rate[2] * x
+    shift = np.eye(6)
+    shift[0, 2] = shift[3, 5] = -y
+    shift[1, 2] = shift[4, 5] = x
+    _congruence(h.cov, shift)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _correct(h, star, correlation) -> None:  # type: ignore[no-untyped-def]
+    """Kalman update with a refitted star: at its pivot x, y and yaw are measured independently, one after another."""
+    _move_pivot(h, star.other_x, star.other_y)
+    cov = h.cov
+    surprise = 0.0
+    for i in range(3):
+        if i == 0:
+            innovation = star.ego_x - h.ego_x
+        elif i == 1:
+            innovation = star.ego_y - h.ego_y
+        else:
+            innovation = wrap(star.yaw - h.yaw)
+        variance = (star.position_variance if i < 2 else star.yaw_variance) * correlation
+        surprise += innovation**2 / (cov[i, i] + variance) / 3.0
+    if surprise > _SURPRISE:
+        # The motion model is wrong at the moment (braking, steering): believe what is seen.
+        cov *= surprise / _SURPRISE
+    for i in range(3):
+        if i == 0:
+            innovation = star.ego_x - h.ego_x
+        elif i == 1:
+            innovation = star.ego_y - h.ego_y
+        else:
+            innovation = wrap(star.yaw - h.yaw)
+        variance = (star.position_variance if i < 2 else star.yaw_variance) * correlation
+        gain = cov[:, i] / (cov[i, i] + variance)
+        row = cov[i, :].copy()
+        h.ego_x += gain[0] * innovation
+        h.ego_y += gain[1] * innovation
+        h.yaw = wrap(h.yaw + gain[2] * innovation)
+        for j in range(3):
+            h.rate[j] += gain[3 + j] * innovation
+        for j in range(6):
+            for k in range(6):
+                cov[j, k] -= gain[j] * row[k]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _start(h, star, motion) -> None:  # type: ignore[no-untyped-def]
+    """Begin anew at a refitted star's pose; nothing is known of its rate."""
+    h.ego_x, h.ego_y, h.other_x, h.other_y = star.ego_x, star.ego_y, star.other_x, star.other_y
+    h.yaw = wrap(star.yaw)
+    h.rate[:] = 0.0
+    h.cov[:] = 0.0
+    for i in range(2):
+        h.cov[i, i] = star.position_variance * motion.correlation
+        h.cov[i + 3, i + 3] = motion.speed_std**2
+    h.cov[2, 2] = star.yaw_variance * motion.correlation
+    h.cov[5, 5] = motion.yaw_rate_std**2
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:  # type: ignore[no-untyped-def]
+    """The star a predicted hypothesis finds where its motion says it should be."""
+    star.ego_x, star.ego_y, star.other_x, star.other_y, star.yaw = h.ego_x, h.ego_y, h.other_x, h.other_y, h.yaw
+    star.position_variance = 0.5 * (h.cov[0, 0] + h.cov[1, 1])
+    star.yaw_variance = h.cov[2, 2]
+    refine(ego, other, sizes, star, pairs, noise, rounds)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:  # type: ignore[no-untyped-def]
+    """Write the rows of the track pairs matched last time that both agents still track; how many there are."""
+    count = 0
+    for k in range(h.tracked_pairs):
+        for m in range(len(ego_ids)):
+            if ego_ids[m] == h.ego_id[k]:
+                for n in range(len(other_ids)):
+                    if other_ids[n] == h.other_id[k] and count < len(pairs):
+                        pairs[count, 0] = m
+                        pairs[count, 1] = n
+                        count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _remember(h, star, pairs, ego_ids, other_ids) -> None:  # type: ignore[no-untyped-def]
+    """Keep the star's evidence and the track ids of its best pairs."""
+    h.frame_evidence = star.evidence
+    h.frames += 1
+    h.pairs = star.pairs
+    h.tracked_pairs = min(star.pairs, _MOST_TRACK_PAIRS) if len(ego_ids) and len(other_ids) else 0
+    for k in range(h.tracked_pairs):
+        h.ego_id[k] = ego_ids[pairs[k, 0]]
+        h.other_id[k] = other_ids[pairs[k, 1]]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _landing_std(h, other) -> float:  # type: ignore[no-untyped-def]
+    """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
+    total = 0.0
+    for n in range(len(other)):
+        squared_arm = (other[n, X] - h.other_x) ** 2 + (other[n, Y] - h.other_y) ** 2
+        total += math.sqrt(h.cov[0, 0] + h.cov[1, 1] + h.cov[2, 2] * squared_arm)
+    return total / len(other) if len(other) else np.inf
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries, rounds):  # type: ignore[no-untyped-def]
+    """One frame: predict, follow, search, link, update.
+
+    Args:
+        old: (H,) `HYPOTHESIS` records of the last frame, best first; overwritten.
+        ego: (M, 5) boxes.
+        other: (N, 5) boxes.
+        ego_ids: (M,) track ids, or (0,) when there are none.
+        other_ids: (N,) likewise.
+        dt: seconds since the last frame.
+        seen: frames seen before this one.
+        noise: the noise model.
+        motion: the motion model.
+        tries: seeds the search refines.
+        rounds: refits of each star.
+
+    Returns:
+        The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the
+        standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; and the (K, 2)
+        rows of ego and other that it matches in this frame.
+    """
+    steps = dt / _STEP
+    memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
+    miss_memory = min(memory, motion.miss_memory**steps)
+    before = len(old)
+    stars = np.zeros(tries + before + 1, STAR)
+    rows = np.empty((len(stars), most_pairs(ego, other, noise), 2), np.int64)
+    star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
+    owner = np.full(len(stars), -1)
+    jumped = np.zeros(len(stars), np.bool_)
+    count = 0
+    sizes = size_evidence(ego, other, noise)
+    for i in range(before):
+        _predict(old[i], dt, motion)
+    if len(ego) > 0 and len(other) > 0:
+        count = search(ego, other, sizes, noise, tries, rounds, stars, rows)
+        for i in range(before):
+            _follow(old[i], ego, other, sizes, star, pairs, noise, rounds)
+            if star.pairs > 0:
+                count = add_star(stars, rows, count, star, pairs)
+
+    kept = np.zeros(count + before, HYPOTHESIS)
+    total = count
+    for i in range(before):
+        h = old[i]
+        gate = motion.link_distance + 2.0 * math.sqrt(max(h.cov[0, 0], h.cov[1, 1]))
+        claimed, merged = -1, False
+        for s in range(count):
+            if same_pose(stars[s], h, gate, motion.link_angle):
+                if owner[s] >= 0:
+                    merged = True
+                elif claimed < 0 or stars[s].evidence > stars[claimed].evidence:
+                    claimed = s
+        if motion.use_tracks and h.tracked_pairs >= 2 and (claimed < 0 or stars[claimed].pairs < h.tracked_pairs):
+            # A frame that jumped (dropped frames, a sudden turn) is still tied down by what both go on tracking.
+            star.pairs = _surviving_pairs(h, ego_ids, other_ids, pairs)
+            if star.pairs >= 2 and (claimed < 0 or star.pairs > stars[claimed].pairs):
+                star.yaw = h.yaw
+                fit_pose(ego, other, star, pairs, noise)
+                best = claimed
+                for s in range(count):
+                    if owner[s] < 0 and same_pose(stars[s], star, motion.link_distance, motion.link_angle):
+                        if best < 0 or stars[s].evidence > stars[best].evidence:
+                            best = s
+                            jumped[s] = True
+                claimed = best
+        if claimed >= 0:
+            owner[claimed] = i
+        elif not merged:
+            h.evidence *= miss_memory
+            h.frame_evidence = 0.0
+            h.pairs = 0
+            if h.evidence > _FORGOTTEN:
+                kept[total] = h
+                total += 1
+    for s in range(count):
+        h = kept[s]
+        fit_pose(ego, other, stars[s], rows[s], noise)
+        if owner[s] >= 0:
+            kept[s] = old[owner[s]]
+        if owner[s] >= 0 and not jumped[s]:
+            _correct(h, stars[s], motion.correlation)
+        else:
+            _start(h, stars[s], motion)
+        h.evidence = memory * h.evidence + (1.0 - memory) * stars[s].evidence
+        _remember(h, stars[s], rows[s], ego_ids, other_ids)
+
+    ranked = np.empty(min(total, _MOST_HYPOTHESES), HYPOTHESIS)
+    taken = np.zeros(total, np.bool_)
+    best_star = -1
+    for i in range(len(ranked)):
+        best = -1
+        for j in range(total):
+            if not taken[j] and (best < 0 or kept[j].evidence > kept[best].evidence):
+                best = j
+        taken[best] = True
+        ranked[i] = kept[best]
+        if i == 0:
+            best_star = best
+    margin = ranked[0].evidence if len(ranked) else 0.0
+    for i in range(1, len(ranked)):
+        if not same_pose(ranked[0], ranked[i], _SAME_DISTANCE, _SAME_ANGLE):
+            margin = ranked[0].evidence - ranked[i].evidence
+            break
+    matched = rows[best_star, : ranked[0].pairs].copy() if 0 <= best_star < count else np.empty((0, 2), np.int64)
+    landing = _landing_std(ranked[0], other) if len(ranked) else np.inf
+    return ranked, margin, landing, matched

@@ -1,0 +1,382 @@
+"""The search for the best common subgraphs of one pair of frames (numba kernels).
+
+As in the paper (section 4.2) every pair of boxes seeds a star: if box m of ego and box n of other are one object,
+their headings and positions fix the relative pose, and every other pair that agrees with it joins the subgraph. What
+differs is how agreement is measured (`evidence`), and that the best stars are refitted to all their members, because
+a heading that is wrong by 2 degrees moves a member 50 m away by 1.7 m.
+
+Three passes keep it fast: all seeds are scored against a raster of nearest boxes; the best are matched and refitted
+exactly; those that end in the same pose are one. A star's pose is written down at a pivot, the centre of the matched
+boxes in both frames, where its translation and rotation errors are independent; nothing here depends on where either
+frame's origin lies.
+
+A star is a record (`STAR`) and a row of pairs. The kernels change both in place, which numba compiles and runs
+several times faster than passing tuples of arrays around. Mind that numba's records are bare pointers: the array a
+record lies in must be used after the record's last use, or it is freed too early.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from cobevglue.alignment.evidence import YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
+from cobevglue.typing import FloatArray, IntArray
+
+__all__ = ["STAR", "add_star", "fit_pose", "match_boxes", "most_pairs", "refine", "same_pose", "search"]
+
+STAR = np.dtype(
+    [
+        ("ego_x", "f8"),  # the pivot in ego's frame [m] ...
+        ("ego_y", "f8"),
+        ("other_x", "f8"),  # ... and in other's: ego = ego_xy + R(yaw) (other - other_xy)
+        ("other_y", "f8"),
+        ("yaw", "f8"),
+        ("position_variance", "f8"),  # of ego_x and of ego_y [m^2]
+        ("yaw_variance", "f8"),  # [rad^2]
+        ("evidence", "f8"),  # of all its pairs [nats]
+        ("pairs", "i8"),  # how many; which ones stand in an array of row numbers beside the record
+    ],
+    align=True,
+)
+
+_GATE = 3.0
+"""A pair farther apart than this many standard deviations is not a match."""
+_HEADING_WEIGHT = 0.67
+"""Headings enter the fit with their noise widened by 1/0.67: their errors within a frame are not independent."""
+_SEED_HEADING_STD = math.radians(4.0)
+_SEED_HEADING_GAIN = 1.6
+"""Evidence of a perfect heading agreement, as a ratio: what `pair_evidence` gives at zero difference, rounded."""
+_SEED_PAIRS = 1600
+"""Above this many pairs only the boxes of other with the rarest sizes seed stars (never fewer than `_FEWEST_SEEDS`)."""
+_FEWEST_SEEDS = 24
+_LEAVES = 16
+"""A seed's rough score counts this many of its nearest neighbours: far ones hang on the seed's heading too much."""
+_LEAST_SIZE_EVIDENCE = -3.0
+"""Boxes of more different sizes than this do not seed a star."""
+_RASTER_CELL, _RASTER_REACH, _RASTER_MOST_CELLS = 1.5, 4.5, 256
+"""Cell [m], how far from a box its cells reach [m], and cells per axis at most."""
+_SAME_DISTANCE, _SAME_ANGLE = 2.0, math.radians(8.0)
+"""Poses that agree this closely at the pivot are one hypothesis [m, rad]."""
+_SAME_SEED_ANGLE = 0.35
+"""A matched pair whose headings turn by nearly the star's yaw would be refined to the same star again [rad]."""
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def most_pairs(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> int:
+    """How many pairs a star can have."""
+    return min(len(ego), len(other)) if noise.one_to_one else len(ego) + len(other)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def match_boxes(ego, other, sizes, star, pairs, noise) -> None:  # type: ignore[no-untyped-def]
+    """Find the pairs that agree with a star's pose, one-to-one, best evidence first.
+
+    The tolerance grows with the distance from the pivot, as far as the star's yaw is uncertain.
+
+    Args:
+        ego: (M, 5) boxes.
+        other: (N, 5) boxes.
+        sizes: (M, N) from `size_evidence`.
+        star: a `STAR` record; its pose is read, its evidence and number of pairs are written.
+        pairs: (>= `most_pairs`, 2) rows of ego and other, written.
+        noise: the noise model.
+    """
+    m_count, n_count = len(ego), len(other)
+    cos, sin = math.cos(star.yaw), math.sin(star.yaw)
+    gain = np.empty(4 * (m_count + n_count))
+    row = np.empty((len(gain), 2), np.int64)
+    found = 0
+    for n in range(n_count):
+        dx, dy = other[n, X] - star.other_x, other[n, Y] - star.other_y
+        x, y = star.ego_x + cos * dx - sin * dy, star.ego_y + sin * dx + cos * dy
+        variance = noise.position_std**2 + star.position_variance
+        if noise.use_range_tolerance:
+            variance += (dx * dx + dy * dy) * star.yaw_variance
+        reach = _GATE * _GATE * variance
+        for m in range(m_count):
+            ex, ey = ego[m, X] - x, ego[m, Y] - y
+            squared = ex * ex + ey * ey
+            if squared < reach and found < len(gain):
+                heading = ego[m, YAW] - other[n, YAW] - star.yaw
+                evidence = pair_evidence(squared, heading, variance, noise) + sizes[m, n]
+                if evidence > 0.0:
+                    place = found
+                    while place > 0 and gain[place - 1] < evidence:
+                        gain[place] = gain[place - 1]
+                        row[place, 0] = row[place - 1, 0]
+                        row[place, 1] = row[place - 1, 1]
+                        place -= 1
+                    gain[place] = evidence
+                    row[place, 0] = m
+                    row[place, 1] = n
+                    found += 1
+    ego_taken, other_taken = np.zeros(m_count, np.bool_), np.zeros(n_count, np.bool_)
+    kept, total = 0, 0.0
+    for i in range(found):
+        m, n = row[i, 0], row[i, 1]
+        if (noise.one_to_one and (ego_taken[m] or other_taken[n])) or kept == len(pairs):
+            continue
+        ego_taken[m] = other_taken[n] = True
+        pairs[kept, 0] = m
+        pairs[kept, 1] = n
+        total += gain[i]
+        kept += 1
+    star.evidence = total
+    star.pairs = kept
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def fit_pose(ego, other, star, pairs, noise) -> None:  # type: ignore[no-untyped-def]
+    """Refit a star's pose to its pairs: Procrustes on the centres (paper, Eq. 7), blended with the headings.
+
+    In the plane the SVD of the paper reduces to one arctangent. Headings count modulo pi around the star's yaw, as
+    measurements of direction with a robust weight; with few or close centres they decide, with many they hardly
+    matter. Writes the pivot, the yaw and both variances.
+    """
+    k = star.pairs
+    ex = ey = ox = oy = 0.0
+    for i in range(k):
+        ex += ego[pairs[i, 0], X] / k
+        ey += ego[pairs[i, 0], Y] / k
+        ox += other[pairs[i, 1], X] / k
+        oy += other[pairs[i, 1], Y] / k
+    variance = noise.position_std**2
+    heading_variance = (noise.heading_std / _HEADING_WEIGHT) ** 2
+    c = s = information = 0.0
+    for i in range(k):
+        m, n = pairs[i, 0], pairs[i, 1]
+        ax, ay = ego[m, X] - ex, ego[m, Y] - ey
+        bx, by = other[n, X] - ox, other[n, Y] - oy
+        c += (bx * ax + by * ay) / variance
+        s += (bx * ay - by * ax) / variance
+        information += (bx * bx + by * by) / variance
+        turn = ego[m, YAW] - other[n, YAW] - star.yaw
+        turn = wrap_half_turn(turn) if noise.use_flips else wrap(turn)
+        weight = 1.0 / (heading_variance * (1.0 + (0.5 * turn / noise.heading_std) ** 2))
+        c += weight * math.cos(star.yaw + turn)
+        s += weight * math.sin(star.yaw + turn)
+        information += weight
+    star.ego_x, star.ego_y, star.other_x, star.other_y = ex, ey, ox, oy
+    star.yaw = math.atan2(s, c)
+    star.position_variance = variance / k
+    star.yaw_variance = 1.0 / information
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def refine(ego, other, sizes, star, pairs, noise, rounds) -> None:  # type: ignore[no-untyped-def]
+    """Match and refit by turns, starting from the star's pose; ends without pairs when nothing agrees."""
+    match_boxes(ego, other, sizes, star, pairs, noise)
+    for _ in range(rounds):
+        if star.pairs == 0:
+            return
+        fit_pose(ego, other, star, pairs, noise)
+        # The residuals' spread is in the noise model already: only the turn about the pivot is left uncertain.
+        star.position_variance = 0.0
+        match_boxes(ego, other, sizes, star, pairs, noise)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def same_pose(a, b, distance, angle) -> bool:  # type: ignore[no-untyped-def]
+    """Whether two records' poses put a's pivot within `distance` [m] and differ by less than `angle` [rad]."""
+    if abs(wrap(a.yaw - b.yaw)) > angle:
+        return False
+    cos, sin = math.cos(b.yaw), math.sin(b.yaw)
+    dx, dy = a.other_x - b.other_x, a.other_y - b.other_y
+    x, y = b.ego_x + cos * dx - sin * dy, b.ego_y + sin * dx + cos * dy
+    return (x - a.ego_x) ** 2 + (y - a.ego_y) ** 2 < distance * distance
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def add_star(stars, rows, count, star, pairs) -> int:  # type: ignore[no-untyped-def]
+    """Add a star to the first `count` of `stars` and return their new number.
+
+    Of stars with one pose the best stays. The last record of `stars` is scratch and never filled.
+    """
+    for i in range(count):
+        if stars[i].evidence >= star.evidence and same_pose(stars[i], star, _SAME_DISTANCE, _SAME_ANGLE):
+            return count
+    kept = 0
+    for i in range(count):
+        if not same_pose(stars[i], star, _SAME_DISTANCE, _SAME_ANGLE):
+            if kept < i:
+                stars[kept] = stars[i]
+                rows[kept] = rows[i]
+            kept += 1
+    if kept < len(stars) - 1:
+        stars[kept] = star
+        rows[kept, : star.pairs] = pairs[: star.pairs]
+        kept += 1
+    return kept
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _nearest_raster(ego):  # type: ignore[no-untyped-def]
+    """Which ego box is nearest to each cell: (cells, cells) rows or -1, with origin x, y and the cell [m]."""
+    low_x, low_y = ego[:, X].min() - _RASTER_REACH, ego[:, Y].min() - _RASTER_REACH
+    width, height = ego[:, X].max() + _RASTER_REACH - low_x, ego[:, Y].max() + _RASTER_REACH - low_y
+    cell = max(_RASTER_CELL, max(width, height) / _RASTER_MOST_CELLS)
+    columns, rows = int(width / cell) + 1, int(height / cell) + 1
+    nearest = np.full((columns, rows), -1, np.int32)
+    gap = np.empty((columns, rows), np.float32)
+    reach = int(_RASTER_REACH / cell) + 1
+    for m in range(len(ego)):
+        u, v = (ego[m, X] - low_x) / cell, (ego[m, Y] - low_y) / cell
+        for i in range(max(0, int(u) - reach), min(columns, int(u) + reach + 1)):
+            for j in range(max(0, int(v) - reach), min(rows, int(v) + reach + 1)):
+                squared = (i + 0.5 - u) ** 2 + (j + 0.5 - v) ** 2
+                if nearest[i, j] < 0 or squared < gap[i, j]:
+                    nearest[i, j] = m
+                    gap[i, j] = squared
+    return nearest, low_x, low_y, cell
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _smallest(values: FloatArray, rows: IntArray) -> None:
+    """Fill `rows` with the rows of the smallest values, smallest first."""
+    count = 0
+    for i in range(len(values)):
+        if count == len(rows) and (count == 0 or values[i] >= values[rows[count - 1]]):
+            continue
+        place = count if count < len(rows) else count - 1
+        while place > 0 and values[rows[place - 1]] > values[i]:
+            if place < len(rows):
+                rows[place] = rows[place - 1]
+            place -= 1
+        rows[place] = i
+        count = min(count + 1, len(rows))
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _seed_rows(sizes: FloatArray) -> IntArray:
+    """The rows of other that seed stars: all, or those whose sizes agree with the fewest of ego's boxes."""
+    m_count, n_count = sizes.shape
+    most = max(_SEED_PAIRS // m_count, _FEWEST_SEEDS)
+    if n_count <= most:
+        return np.arange(n_count)
+    likeness = np.zeros(n_count)
+    for m in range(m_count):
+        for n in range(n_count):
+            likeness[n] += math.exp(sizes[m, n])
+    rows = np.empty(most, np.int64)
+    _smallest(likeness, rows)
+    return rows
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _score_seeds(ego, other, sizes, noise):  # type: ignore[no-untyped-def]
+    """Every seed's rough evidence: (S,) scores and (S, 3) ego row, other row, flipped."""
+    m_count, n_count = len(ego), len(other)
+    seed_rows = _seed_rows(sizes)
+    nearest, low_x, low_y, cell = _nearest_raster(ego)
+    columns, rows = nearest.shape
+    ego_cos, ego_sin = np.cos(ego[:, YAW]), np.sin(ego[:, YAW])
+    other_cos, other_sin = np.cos(other[:, YAW]), np.sin(other[:, YAW])
+    upright = math.log(2.0 * (1.0 - noise.flip_probability)) if noise.use_flips else math.log(2.0)
+    turned = math.log(2.0 * noise.flip_probability) if noise.use_flips else -20.0
+    heading_gain = math.log(_SEED_HEADING_GAIN)
+    sharpness = 0.5 / noise.heading_std**2
+    flips = 2 if noise.use_flips else 1
+    score = np.empty(m_count * len(seed_rows) * flips)
+    seed = np.empty((len(score), 3), np.int32)
+    leaves = min(n_count - 1, _LEAVES)
+    leaf_rows = np.empty(leaves, np.int64)
+    gap = np.empty(n_count)
+    dx, dy, constant, inverse = np.empty(leaves), np.empty(leaves), np.empty(leaves), np.empty(leaves)
+    count = 0
+    for n in seed_rows:
+        for q in range(n_count):
+            gap[q] = (other[q, X] - other[n, X]) ** 2 + (other[q, Y] - other[n, Y]) ** 2
+        gap[n] = np.inf
+        _smallest(gap, leaf_rows)
+        for i in range(leaves):
+            q = leaf_rows[i]
+            dx[i], dy[i] = other[q, X] - other[n, X], other[q, Y] - other[n, Y]
+            variance = noise.position_std**2
+            if noise.use_range_tolerance:
+                variance += (dx[i] ** 2 + dy[i] ** 2) * _SEED_HEADING_STD**2
+            constant[i] = heading_gain - math.log(2.0 * math.pi * variance * noise.density)
+            inverse[i] = 0.5 / variance
+        for m in range(m_count):
+            if sizes[m, n] < _LEAST_SIZE_EVIDENCE:
+                continue
+            for flip in range(flips):
+                sign = 1.0 - 2.0 * flip
+                cos = sign * (ego_cos[m] * other_cos[n] + ego_sin[m] * other_sin[n])
+                sin = sign * (ego_sin[m] * other_cos[n] - ego_cos[m] * other_sin[n])
+                x0, y0 = (ego[m, X] - low_x) / cell, (ego[m, Y] - low_y) / cell
+                total = sizes[m, n]
+                for i in range(leaves):
+                    u = x0 + (cos * dx[i] - sin * dy[i]) / cell
+                    v = y0 + (sin * dx[i] + cos * dy[i]) / cell
+                    if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+                        continue
+                    p = nearest[int(u), int(v)]
+                    if p < 0:
+                        continue
+                    q = leaf_rows[i]
+                    ex, ey = (u * cell + low_x) - ego[p, X], (v * cell + low_y) - ego[p, Y]
+                    gain = constant[i] + sizes[p, q] - (ex * ex + ey * ey) * inverse[i]
+                    if gain > 0.0:
+                        head_cos = cos * other_cos[q] - sin * other_sin[q]
+                        head_sin = sin * other_cos[q] + cos * other_sin[q]
+                        across = ego_cos[p] * head_sin - ego_sin[p] * head_cos
+                        gain -= min(across * across * sharpness, 3.0)
+                        gain += upright if ego_cos[p] * head_cos + ego_sin[p] * head_sin > 0.0 else turned
+                        if gain > 0.0:
+                            total += gain
+                score[count] = total
+                seed[count, 0] = m
+                seed[count, 1] = n
+                seed[count, 2] = flip
+                count += 1
+    return score[:count], seed[:count]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def search(ego, other, sizes, noise, tries, rounds, stars, rows):  # type: ignore[no-untyped-def]
+    """Find the best stars of one pair of frames, no two of them with the same pose.
+
+    Args:
+        ego: (M, 5) boxes, at least one.
+        other: (N, 5) boxes, at least one.
+        sizes: (M, N) from `size_evidence`.
+        noise: the noise model.
+        tries: seeds refined at most.
+        rounds: refits of each.
+        stars: (> tries,) `STAR` records, written from the first on; the last one is scratch.
+        rows: (S, >= `most_pairs`, 2) the pairs of each, written.
+
+    Returns:
+        How many were found.
+    """
+    score, seed = _score_seeds(ego, other, sizes, noise)
+    star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
+    count = 0
+    for _ in range(min(tries, len(score))):
+        best = 0
+        for i in range(len(score)):
+            if score[i] > score[best]:
+                best = i
+        if score[best] == -np.inf:
+            break
+        score[best] = -np.inf
+        m, n = seed[best, 0], seed[best, 1]
+        star.ego_x, star.ego_y, star.other_x, star.other_y = ego[m, X], ego[m, Y], other[n, X], other[n, Y]
+        star.yaw = ego[m, YAW] - other[n, YAW] + math.pi * seed[best, 2]
+        star.position_variance, star.yaw_variance = 0.0, _SEED_HEADING_STD**2
+        refine(ego, other, sizes, star, pairs, noise, rounds)
+        if star.pairs == 0:
+            continue
+        star.yaw = wrap(star.yaw)
+        for i in range(len(score)):
+            turn = ego[seed[i, 0], YAW] - other[seed[i, 1], YAW] + math.pi * seed[i, 2] - star.yaw
+            if score[i] > -np.inf and abs(wrap(turn)) < _SAME_SEED_ANGLE:
+                for k in range(star.pairs):
+                    if pairs[k, 0] == seed[i, 0] and pairs[k, 1] == seed[i, 1]:
+                        score[i] = -np.inf
+                        break
+        count = add_star(stars, rows, count, star, pairs)
+    return count
