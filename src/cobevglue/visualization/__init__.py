@@ -1,0 +1,25 @@
+"""Pictures seen from above and report pages. Importing this imports matplotlib, but neither pyplot nor a display."""
+
+from cobevglue.visualization.alignment import draw_alignment
+from cobevglue.visualization.bev import draw_agent, draw_boxes, draw_object_graph, draw_pairs
+from cobevglue.visualization.report_page import Section, Table, write_page
+from cobevglue.visualization.style import EGO, MATCH, OTHER, TRUTH, add_axes, new_figure, save_figure, style_bev
+
+__all__ = [
+    "EGO",
+    "MATCH",
+    "OTHER",
+    "TRUTH",
+    "Section",
+    "Table",
+    "add_axes",
+    "draw_agent",
+    "draw_alignment",
+    "draw_boxes",
+    "draw_object_graph",
+    "draw_pairs",
+    "new_figure",
+    "save_figure",
+    "style_bev",
+    "write_page",
+]
