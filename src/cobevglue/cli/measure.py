@@ -1,0 +1,157 @@
+"""Times the steps between two object lists and a relative pose, on made-up frames of any number of objects."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cobevglue.alignment import BEVGlue, BEVGlueConfig
+from cobevglue.boxes import Boxes
+from cobevglue.messages import ObjectMessage, decode, encode
+from cobevglue.se2 import SE2
+from cobevglue.tracking import Sort
+
+__all__ = ["OBJECT_COUNTS", "STEPS", "measure"]
+
+OBJECT_COUNTS = (5, 15, 40, 100, 200)
+TRACK, ENCODE, DECODE = "track", "encode", "decode"
+FIRST, LATER = "BEVGlue, first frame", "BEVGlue, later frames"
+PAPER_FIRST, PAPER_LATER = "paper's settings, first frame", "paper's settings, later frames"
+STEPS = (TRACK, ENCODE, DECODE, FIRST, LATER, PAPER_FIRST, PAPER_LATER)
+"""What is timed: a frame of one tracker, a message, and an alignment without and with frames before it."""
+
+_FRAMES = 25  # of a sequence
+_WARM_UP = 5  # frames of a sequence that are not timed
+_SECONDS_AT_MOST = 2.0  # for a step at one object count; fewer frames are then timed, at least one
+_PAPER_OBJECTS_AT_MOST = 100  # the search of the paper's settings takes minutes for more
+_SHARED = 0.6  # of the objects are seen by both agents
+_AREA_PER_OBJECT = 250.0  # [m^2]: traffic is as dense whatever the number
+_SEED = 0
+
+
+def measure(progress: Callable[[int], None]) -> dict[str, Any]:
+    """Time every step at every object count.
+
+    Args:
+        progress: called with each object count before it is measured.
+
+    Returns:
+        Ready for JSON: `steps[step][count]` with `median_ms`, `best_ms` and `repeats`, or None where it would take too
+        long; `message_bytes[count]`; machine and versions.
+    """
+    steps: dict[str, dict[str, Any]] = {step: {} for step in STEPS}
+    message_bytes = {}
+    _run(OBJECT_COUNTS[0], _WARM_UP + 1)  # compile, or load what was compiled
+    for count in OBJECT_COUNTS:
+        progress(count)
+        taken, message_bytes[str(count)] = _run(count, _FRAMES)
+        for step in STEPS:
+            steps[step][str(count)] = _statistics(taken[step]) if step in taken else None
+    packages = ("cobevglue", "numpy", "numba", "scipy")
+    return {
+        "steps": steps,
+        "message_bytes": message_bytes,
+        "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system()},
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+    }
+
+
+def _statistics(seconds: list[float]) -> dict[str, float | int]:
+    return {"median_ms": 1e3 * statistics.median(seconds), "best_ms": 1e3 * min(seconds), "repeats": len(seconds)}
+
+
+def _run(count: int, frames: int) -> tuple[dict[str, list[float]], int]:
+    """Seconds that each step took in the frames of a sequence, and the length of a message."""
+    scene = [_scene(count, index) for index in range(frames)]
+    ego_tracker, other_tracker, timed_tracker = Sort(), Sort(), Sort()
+    tracked = [(ego_tracker.update(ego), other_tracker.update(other)) for ego, other in scene]
+    messages = [ObjectMessage("car2", 0.1 * index, index, other) for index, (_, other) in enumerate(tracked)]
+    encoded = [encode(message) for message in messages]
+    taken = {
+        TRACK: _times(timed_tracker.update, [(ego,) for ego, _ in scene], _WARM_UP),
+        ENCODE: _times(encode, [(message,) for message in messages], _WARM_UP),
+        DECODE: _times(decode, [(data,) for data in encoded], _WARM_UP),
+        FIRST: _times(BEVGlue().align, tracked, forget=True),
+        LATER: _times(BEVGlue().align, tracked, _WARM_UP),
+    }
+    if count <= _PAPER_OBJECTS_AT_MOST:
+        paper = BEVGlueConfig.paper()
+        taken[PAPER_FIRST] = _times(BEVGlue(paper).align, tracked, forget=True)
+        taken[PAPER_LATER] = _times(BEVGlue(paper).align, tracked, _WARM_UP)
+    return taken, len(encoded[0])
+
+
+def _times(
+    step: Callable[..., object], inputs: Sequence[tuple[Any, ...]], skip: int = 0, *, forget: bool = False
+) -> list[float]:
+    """Seconds that a step took for each of these inputs but the first ones; it stops early after long enough.
+
+    Args:
+        step: what is timed.
+        inputs: its arguments, call by call.
+        skip: how many of the first calls are not timed.
+        forget: reset whose method the step is before each call.
+    """
+    seconds: list[float] = []
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        for number, arguments in enumerate(inputs):
+            if forget:
+                step.__self__.reset()  # type: ignore[attr-defined]
+            start = time.perf_counter()
+            step(*arguments)
+            if number >= skip:
+                seconds.append(time.perf_counter() - start)
+            if sum(seconds) > _SECONDS_AT_MOST:
+                break
+    finally:
+        if collects:
+            gc.enable()
+    return seconds
+
+
+def _scene(count: int, index: int) -> tuple[Boxes, Boxes]:
+    """What two agents detect of one set of standing cars in frame `index`: `count` boxes each, partly the same."""
+    world = np.random.default_rng([_SEED, count])
+    shared = round(_SHARED * count)
+    total = 2 * count - shared
+    side = math.sqrt(_AREA_PER_OBJECT * total)
+    cars = Boxes(
+        center=np.column_stack([world.uniform(-side / 2, side / 2, (total, 2)), np.zeros(total)]),
+        size=[4.5, 1.9, 1.6] + world.normal(0.0, [0.3, 0.08, 0.1], (total, 3)),
+        yaw=world.uniform(-math.pi, math.pi, total),
+    )
+    noise = np.random.default_rng([_SEED, count, index + 1])
+    other_SE2_ego = SE2(12.0, -8.0, 2.0)
+    mine, theirs = cars[:count], cars[total - count :].transform(other_SE2_ego)
+    return _detected(mine, noise), _detected(theirs, noise)
+
+
+def _detected(boxes: Boxes, rng: np.random.Generator) -> Boxes:
+    """The boxes as a detector has them, in no particular order."""
+    n = len(boxes)
+    noisy = boxes.replace(
+        center=boxes.center + rng.normal(0.0, 0.2, (n, 3)), yaw=boxes.yaw + rng.normal(0.0, math.radians(2.0), n)
+    )
+    return noisy[rng.permutation(n)]
+
+
+def _processor() -> str:
+    """The processor's name, where the system tells it."""
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
