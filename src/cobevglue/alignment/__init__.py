@@ -1,4 +1,4 @@
-"""Sources of the relative pose between two agents. `BEVGlue` is ours and the paper's; all share the `Aligner` protocol."""
+"""Sources of the relative pose between two agents. All share the `Aligner` protocol."""
 
 from cobevglue.alignment.alignment import Aligner, Alignment
 from cobevglue.alignment.bevglue import BEVGlue

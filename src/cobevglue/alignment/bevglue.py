@@ -173,7 +173,7 @@ class _EvidenceMatcher:
         return Alignment(pose, pairs, covariance, "", evidence, margin)
 
     def _doubt(self, pairs: int, evidence: float, margin: float, landing_std: float) -> str:
-        """Why the best pose should not be trusted, or ""."""
+        """Why the best pose should not be trusted, or an empty string."""
         config = self._config
         needed = max(config.min_margin, config.min_relative_margin * evidence)
         if pairs == 0:

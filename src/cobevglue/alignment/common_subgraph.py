@@ -1,7 +1,7 @@
 """Temporally consistent maximum common subgraph, as the paper has it (section 4.2): candidates, expansion, selection.
 
-Plain NumPy, and the reference for what the robust variant changes. Where the text is silent: affinities and
-thresholds are `AffinityConfig`; when no pair of the last subgraph is still tracked by both agents, all pairs seed again.
+Plain NumPy, and the reference for what the robust variant changes. Where the text is silent: affinities and thresholds
+are `AffinityConfig`; when no pair of the last subgraph is still tracked by both agents, all pairs seed again.
 """
 
 from __future__ import annotations

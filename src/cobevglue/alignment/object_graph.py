@@ -1,4 +1,4 @@
-"""Object graphs: what one agent sees, written so that it does not depend on where the agent stands (paper, section 4.1)."""
+"""Object graphs: what one agent sees, wherever it stands (paper, section 4.1)."""
 
 from __future__ import annotations
 

@@ -19,8 +19,7 @@ import numpy as np
 from numba import njit
 
 from cobevglue.alignment.evidence import NoiseModel, X, Y, size_evidence, wrap
-from cobevglue.alignment.pose_search import STAR, add_star, fit_pose, most_pairs, refine, same_pose, search
-from cobevglue.typing import FloatArray
+from cobevglue.alignment.pose_search import STAR, add_star, copy_pairs, fit_pose, most_pairs, refine, same_pose, search
 
 __all__ = ["HYPOTHESIS", "Motion", "NoiseModel", "advance"]
 
@@ -72,8 +71,17 @@ class Motion(NamedTuple):
     use_tracks: bool
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _predict(h, dt: float, motion: Motion) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _mix(cov, i: int, k: int, factor: float) -> None:
+    """What adding `factor` times component k to component i of the state does to its covariance."""
+    for j in range(6):
+        cov[i, j] += factor * cov[k, j]
+    for j in range(6):
+        cov[j, i] += factor * cov[j, k]
+
+
+@njit(cache=True, error_model="numpy")
+def _predict(h, dt: float, motion: Motion) -> None:
     """Constant-twist step of the Kalman filter: the velocity turns with the relative yaw.
 
     When either agent drives a circle, so does every point of its frame in the other's.
@@ -84,12 +92,12 @@ def _predict(h, dt: float, motion: Motion) -> None:  # type: ignore[no-untyped-d
     h.ego_x += 0.5 * (vx + h.rate[0]) * dt
     h.ego_y += 0.5 * (vy + h.rate[1]) * dt
     h.yaw = wrap(h.yaw + h.rate[2] * dt)
-    step = np.eye(6)
     for i in range(3):
-        step[i, i + 3] = dt
-    step[0, 5], step[1, 5] = -0.5 * vy * dt * dt, 0.5 * vx * dt * dt
-    step[3, 5], step[4, 5] = -vy * dt, vx * dt
-    _congruence(h.cov, step)
+        _mix(h.cov, i, i + 3, dt)
+    _mix(h.cov, 0, 5, -0.5 * vy * dt * dt)
+    _mix(h.cov, 1, 5, 0.5 * vx * dt * dt)
+    _mix(h.cov, 3, 5, -vy * dt)
+    _mix(h.cov, 4, 5, vx * dt)
     for i in range(3):
         q = (motion.acceleration if i < 2 else motion.yaw_acceleration) ** 2
         h.cov[i, i] += q * dt**3 / 3.0
@@ -98,25 +106,8 @@ def _predict(h, dt: float, motion: Motion) -> None:  # type: ignore[no-untyped-d
         h.cov[i + 3, i + 3] += q * dt
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _congruence(cov: FloatArray, matrix: FloatArray) -> None:
-    """`cov = matrix cov matrix^T`, in place, for (6, 6)."""
-    half = np.zeros((6, 6))
-    for i in range(6):
-        for k in range(6):
-            if matrix[i, k] != 0.0:
-                for j in range(6):
-                    half[i, j] += matrix[i, k] * cov[k, j]
-    cov[:] = 0.0
-    for j in range(6):
-        for k in range(6):
-            if matrix[j, k] != 0.0:
-                for i in range(6):
-                    cov[i, j] += half[i, k] * matrix[j, k]
-
-
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _move_pivot(h, other_x: float, other_y: float) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _move_pivot(h, other_x: float, other_y: float) -> None:
     """Write the same pose, rate and covariance down at another point of other's frame."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
     dx, dy = other_x - h.other_x, other_y - h.other_y
@@ -126,57 +117,56 @@ def _move_pivot(h, other_x: float, other_y: float) -> None:  # type: ignore[no-u
     h.other_x, h.other_y = other_x, other_y
     h.rate[0] -= h.rate[2] * y
     h.rate[1] += h.rate[2] * x
-    shift = np.eye(6)
-    shift[0, 2] = shift[3, 5] = -y
-    shift[1, 2] = shift[4, 5] = x
-    _congruence(h.cov, shift)
+    for i in (0, 3):
+        _mix(h.cov, i, i // 3 * 3 + 2, -y)
+        _mix(h.cov, i + 1, i // 3 * 3 + 2, x)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _correct(h, star, correlation) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _correct(h, star, correlation) -> None:
     """Kalman update with a refitted star: at its pivot x, y and yaw are measured independently, one after another."""
     _move_pivot(h, star.other_x, star.other_y)
-    cov = h.cov
+    cov, row = h.cov, np.empty(6)
+    innovation, variance = np.empty(3), np.empty(3)
+    innovation[0], innovation[1] = star.ego_x - h.ego_x, star.ego_y - h.ego_y
+    innovation[2] = wrap(star.yaw - h.yaw)
+    variance[0] = variance[1] = star.position_variance * correlation
+    variance[2] = star.yaw_variance * correlation
     surprise = 0.0
     for i in range(3):
-        if i == 0:
-            innovation = star.ego_x - h.ego_x
-        elif i == 1:
-            innovation = star.ego_y - h.ego_y
-        else:
-            innovation = wrap(star.yaw - h.yaw)
-        variance = (star.position_variance if i < 2 else star.yaw_variance) * correlation
-        surprise += innovation**2 / (cov[i, i] + variance) / 3.0
+        surprise += innovation[i] ** 2 / (cov[i, i] + variance[i]) / 3.0
     if surprise > _SURPRISE:
         # The motion model is wrong at the moment (braking, steering): believe what is seen.
-        cov *= surprise / _SURPRISE
+        for i in range(6):
+            for j in range(6):
+                cov[i, j] *= surprise / _SURPRISE
+    change = np.zeros(6)
     for i in range(3):
-        if i == 0:
-            innovation = star.ego_x - h.ego_x
-        elif i == 1:
-            innovation = star.ego_y - h.ego_y
-        else:
-            innovation = wrap(star.yaw - h.yaw)
-        variance = (star.position_variance if i < 2 else star.yaw_variance) * correlation
-        gain = cov[:, i] / (cov[i, i] + variance)
-        row = cov[i, :].copy()
-        h.ego_x += gain[0] * innovation
-        h.ego_y += gain[1] * innovation
-        h.yaw = wrap(h.yaw + gain[2] * innovation)
-        for j in range(3):
-            h.rate[j] += gain[3 + j] * innovation
+        left = innovation[i] - change[i]
         for j in range(6):
+            row[j] = cov[i, j]
+        for j in range(6):
+            gain = row[j] / (row[i] + variance[i])
+            change[j] += gain * left
             for k in range(6):
-                cov[j, k] -= gain[j] * row[k]
+                cov[j, k] -= gain * row[k]
+    h.ego_x += change[0]
+    h.ego_y += change[1]
+    h.yaw = wrap(h.yaw + change[2])
+    for j in range(3):
+        h.rate[j] += change[3 + j]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _start(h, star, motion) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _start(h, star, motion) -> None:
     """Begin anew at a refitted star's pose; nothing is known of its rate."""
     h.ego_x, h.ego_y, h.other_x, h.other_y = star.ego_x, star.ego_y, star.other_x, star.other_y
     h.yaw = wrap(star.yaw)
-    h.rate[:] = 0.0
-    h.cov[:] = 0.0
+    for i in range(6):
+        for j in range(6):
+            h.cov[i, j] = 0.0
+    for i in range(3):
+        h.rate[i] = 0.0
     for i in range(2):
         h.cov[i, i] = star.position_variance * motion.correlation
         h.cov[i + 3, i + 3] = motion.speed_std**2
@@ -184,8 +174,8 @@ def _start(h, star, motion) -> None:  # type: ignore[no-untyped-def]
     h.cov[5, 5] = motion.yaw_rate_std**2
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:
     """The star a predicted hypothesis finds where its motion says it should be."""
     star.ego_x, star.ego_y, star.other_x, star.other_y, star.yaw = h.ego_x, h.ego_y, h.other_x, h.other_y, h.yaw
     star.position_variance = 0.5 * (h.cov[0, 0] + h.cov[1, 1])
@@ -193,8 +183,8 @@ def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:  # type: 
     refine(ego, other, sizes, star, pairs, noise, rounds)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:
     """Write the rows of the track pairs matched last time that both agents still track; how many there are."""
     count = 0
     for k in range(h.tracked_pairs):
@@ -208,8 +198,8 @@ def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:  # type: ignore[no-un
     return count
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _remember(h, star, pairs, ego_ids, other_ids) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _remember(h, star, pairs, ego_ids, other_ids) -> None:
     """Keep the star's evidence and the track ids of its best pairs."""
     h.frame_evidence = star.evidence
     h.frames += 1
@@ -220,8 +210,8 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:  # type: ignore[no-un
         h.other_id[k] = other_ids[pairs[k, 1]]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _landing_std(h, other) -> float:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _landing_std(h, other) -> float:
     """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
     total = 0.0
     for n in range(len(other)):
@@ -230,8 +220,8 @@ def _landing_std(h, other) -> float:  # type: ignore[no-untyped-def]
     return total / len(other) if len(other) else np.inf
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries, rounds):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries, rounds):
     """One frame: predict, follow, search, link, update.
 
     Args:
@@ -259,7 +249,9 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
     stars = np.zeros(tries + before + 1, STAR)
     rows = np.empty((len(stars), most_pairs(ego, other, noise), 2), np.int64)
     star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
-    owner = np.full(len(stars), -1)
+    owner = np.empty(len(stars), np.int64)
+    for s in range(len(stars)):
+        owner[s] = -1
     jumped = np.zeros(len(stars), np.bool_)
     count = 0
     sizes = size_evidence(ego, other, noise)
@@ -292,11 +284,15 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
                 fit_pose(ego, other, star, pairs, noise)
                 best = claimed
                 for s in range(count):
-                    if owner[s] < 0 and same_pose(stars[s], star, motion.link_distance, motion.link_angle):
-                        if best < 0 or stars[s].evidence > stars[best].evidence:
-                            best = s
-                            jumped[s] = True
-                claimed = best
+                    if (
+                        owner[s] < 0
+                        and same_pose(stars[s], star, motion.link_distance, motion.link_angle)
+                        and (best < 0 or stars[s].evidence > stars[best].evidence)
+                    ):
+                        best = s
+                if best != claimed:
+                    claimed = best
+                    jumped[best] = True
         if claimed >= 0:
             owner[claimed] = i
         elif not merged:
@@ -335,6 +331,8 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
         if not same_pose(ranked[0], ranked[i], _SAME_DISTANCE, _SAME_ANGLE):
             margin = ranked[0].evidence - ranked[i].evidence
             break
-    matched = rows[best_star, : ranked[0].pairs].copy() if 0 <= best_star < count else np.empty((0, 2), np.int64)
+    matched = np.empty((ranked[0].pairs if 0 <= best_star < count else 0, 2), np.int64)
+    if len(matched):
+        copy_pairs(matched, rows[best_star], len(matched))
     landing = _landing_std(ranked[0], other) if len(ranked) else np.inf
     return ranked, margin, landing, matched

@@ -25,7 +25,7 @@ from numba import njit
 from cobevglue.alignment.evidence import YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
 from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["STAR", "add_star", "fit_pose", "match_boxes", "most_pairs", "refine", "same_pose", "search"]
+__all__ = ["STAR", "add_star", "copy_pairs", "fit_pose", "match_boxes", "most_pairs", "refine", "same_pose", "search"]
 
 STAR = np.dtype(
     [
@@ -64,14 +64,14 @@ _SAME_SEED_ANGLE = 0.35
 """A matched pair whose headings turn by nearly the star's yaw would be refined to the same star again [rad]."""
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")
 def most_pairs(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> int:
     """How many pairs a star can have."""
     return min(len(ego), len(other)) if noise.one_to_one else len(ego) + len(other)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def match_boxes(ego, other, sizes, star, pairs, noise) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     """Find the pairs that agree with a star's pose, one-to-one, best evidence first.
 
     The tolerance grows with the distance from the pivot, as far as the star's yaw is uncertain.
@@ -128,8 +128,8 @@ def match_boxes(ego, other, sizes, star, pairs, noise) -> None:  # type: ignore[
     star.pairs = kept
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def fit_pose(ego, other, star, pairs, noise) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def fit_pose(ego, other, star, pairs, noise) -> None:
     """Refit a star's pose to its pairs: Procrustes on the centres (paper, Eq. 7), blended with the headings.
 
     In the plane the SVD of the paper reduces to one arctangent. Headings count modulo pi around the star's yaw, as
@@ -165,21 +165,21 @@ def fit_pose(ego, other, star, pairs, noise) -> None:  # type: ignore[no-untyped
     star.yaw_variance = 1.0 / information
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def refine(ego, other, sizes, star, pairs, noise, rounds) -> None:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def refine(ego, other, sizes, star, pairs, noise, rounds) -> None:
     """Match and refit by turns, starting from the star's pose; ends without pairs when nothing agrees."""
-    match_boxes(ego, other, sizes, star, pairs, noise)
-    for _ in range(rounds):
+    for i in range(rounds + 1):
+        if i > 0:
+            fit_pose(ego, other, star, pairs, noise)
+            # The residuals' spread is in the noise model already: only the turn about the pivot is left uncertain.
+            star.position_variance = 0.0
+        match_boxes(ego, other, sizes, star, pairs, noise)
         if star.pairs == 0:
             return
-        fit_pose(ego, other, star, pairs, noise)
-        # The residuals' spread is in the noise model already: only the turn about the pivot is left uncertain.
-        star.position_variance = 0.0
-        match_boxes(ego, other, sizes, star, pairs, noise)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def same_pose(a, b, distance, angle) -> bool:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def same_pose(a, b, distance, angle) -> bool:
     """Whether two records' poses put a's pivot within `distance` [m] and differ by less than `angle` [rad]."""
     if abs(wrap(a.yaw - b.yaw)) > angle:
         return False
@@ -189,8 +189,17 @@ def same_pose(a, b, distance, angle) -> bool:  # type: ignore[no-untyped-def]
     return (x - a.ego_x) ** 2 + (y - a.ego_y) ** 2 < distance * distance
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def add_star(stars, rows, count, star, pairs) -> int:  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def copy_pairs(target, source, count) -> None:
+    """Copy the first `count` pairs."""
+    # Loops, here and elsewhere: numba compiles slices and array expressions far more slowly, and runs them no faster.
+    for k in range(count):
+        target[k, 0] = source[k, 0]
+        target[k, 1] = source[k, 1]
+
+
+@njit(cache=True, error_model="numpy")
+def add_star(stars, rows, count, star, pairs) -> int:
     """Add a star to the first `count` of `stars` and return their new number.
 
     Of stars with one pose the best stays. The last record of `stars` is scratch and never filled.
@@ -203,23 +212,31 @@ def add_star(stars, rows, count, star, pairs) -> int:  # type: ignore[no-untyped
         if not same_pose(stars[i], star, _SAME_DISTANCE, _SAME_ANGLE):
             if kept < i:
                 stars[kept] = stars[i]
-                rows[kept] = rows[i]
+                copy_pairs(rows[kept], rows[i], stars[i].pairs)
             kept += 1
     if kept < len(stars) - 1:
         stars[kept] = star
-        rows[kept, : star.pairs] = pairs[: star.pairs]
+        copy_pairs(rows[kept], pairs, star.pairs)
         kept += 1
     return kept
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _nearest_raster(ego):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _nearest_raster(ego):
     """Which ego box is nearest to each cell: (cells, cells) rows or -1, with origin x, y and the cell [m]."""
-    low_x, low_y = ego[:, X].min() - _RASTER_REACH, ego[:, Y].min() - _RASTER_REACH
-    width, height = ego[:, X].max() + _RASTER_REACH - low_x, ego[:, Y].max() + _RASTER_REACH - low_y
+    low_x = high_x = ego[0, X]
+    low_y = high_y = ego[0, Y]
+    for m in range(1, len(ego)):
+        low_x, high_x = min(low_x, ego[m, X]), max(high_x, ego[m, X])
+        low_y, high_y = min(low_y, ego[m, Y]), max(high_y, ego[m, Y])
+    low_x, low_y = low_x - _RASTER_REACH, low_y - _RASTER_REACH
+    width, height = high_x + _RASTER_REACH - low_x, high_y + _RASTER_REACH - low_y
     cell = max(_RASTER_CELL, max(width, height) / _RASTER_MOST_CELLS)
     columns, rows = int(width / cell) + 1, int(height / cell) + 1
-    nearest = np.full((columns, rows), -1, np.int32)
+    nearest = np.empty((columns, rows), np.int32)
+    for i in range(columns):
+        for j in range(rows):
+            nearest[i, j] = -1
     gap = np.empty((columns, rows), np.float32)
     reach = int(_RASTER_REACH / cell) + 1
     for m in range(len(ego)):
@@ -233,7 +250,7 @@ def _nearest_raster(ego):  # type: ignore[no-untyped-def]
     return nearest, low_x, low_y, cell
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")
 def _smallest(values: FloatArray, rows: IntArray) -> None:
     """Fill `rows` with the rows of the smallest values, smallest first."""
     count = 0
@@ -249,13 +266,16 @@ def _smallest(values: FloatArray, rows: IntArray) -> None:
         count = min(count + 1, len(rows))
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")
 def _seed_rows(sizes: FloatArray) -> IntArray:
     """The rows of other that seed stars: all, or those whose sizes agree with the fewest of ego's boxes."""
     m_count, n_count = sizes.shape
     most = max(_SEED_PAIRS // m_count, _FEWEST_SEEDS)
     if n_count <= most:
-        return np.arange(n_count)
+        rows = np.empty(n_count, np.int64)
+        for n in range(n_count):
+            rows[n] = n
+        return rows
     likeness = np.zeros(n_count)
     for m in range(m_count):
         for n in range(n_count):
@@ -265,15 +285,24 @@ def _seed_rows(sizes: FloatArray) -> IntArray:
     return rows
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _score_seeds(ego, other, sizes, noise):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def _directions(boxes):
+    """Cosines and sines of the headings."""
+    cos, sin = np.empty(len(boxes)), np.empty(len(boxes))
+    for i in range(len(boxes)):
+        cos[i], sin[i] = math.cos(boxes[i, YAW]), math.sin(boxes[i, YAW])
+    return cos, sin
+
+
+@njit(cache=True, error_model="numpy")
+def _score_seeds(ego, other, sizes, noise):
     """Every seed's rough evidence: (S,) scores and (S, 3) ego row, other row, flipped."""
     m_count, n_count = len(ego), len(other)
     seed_rows = _seed_rows(sizes)
     nearest, low_x, low_y, cell = _nearest_raster(ego)
     columns, rows = nearest.shape
-    ego_cos, ego_sin = np.cos(ego[:, YAW]), np.sin(ego[:, YAW])
-    other_cos, other_sin = np.cos(other[:, YAW]), np.sin(other[:, YAW])
+    ego_cos, ego_sin = _directions(ego)
+    other_cos, other_sin = _directions(other)
     upright = math.log(2.0 * (1.0 - noise.flip_probability)) if noise.use_flips else math.log(2.0)
     turned = math.log(2.0 * noise.flip_probability) if noise.use_flips else -20.0
     heading_gain = math.log(_SEED_HEADING_GAIN)
@@ -335,8 +364,8 @@ def _score_seeds(ego, other, sizes, noise):  # type: ignore[no-untyped-def]
     return score[:count], seed[:count]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def search(ego, other, sizes, noise, tries, rounds, stars, rows):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy")
+def search(ego, other, sizes, noise, tries, rounds, stars, rows):
     """Find the best stars of one pair of frames, no two of them with the same pose.
 
     Args:

@@ -1,0 +1,166 @@
+"""How well an aligner finds the relative pose, frame by frame, by how many objects both agents detected.
+
+*Landing error*: how far other's boxes lie from where the true pose puts them, on average over the boxes [m]. It is what
+a user of the pose notices, and unlike the error of the translation it does not depend on where the frames' origins are.
+
+*Right*: accepted with a landing error below 3 m. *Wrong*: accepted but not right. *Success at k*: accepted with a
+translation error below k m and a yaw error below k degrees. A refusal is neither right nor wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cobevglue.alignment.alignment import Aligner
+from cobevglue.boxes import Boxes
+from cobevglue.se2 import SE2
+from cobevglue.typing import IntArray
+
+__all__ = ["AlignmentSequence", "PairFrame", "Record", "Summary", "evaluate", "landing_error", "summarise"]
+
+RIGHT = 3.0
+"""Landing error of a right pose [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairFrame:
+    """What two agents saw at one time, and the truth about it.
+
+    Attributes:
+        ego: tracked boxes in ego's frame.
+        other: tracked boxes in other's frame.
+        ego_SE2_other: the true relative pose.
+        co_visible: how many objects both detected.
+        pairs: (K, 2) rows of ego and other that are one object, or None where this is not known.
+    """
+
+    ego: Boxes
+    other: Boxes
+    ego_SE2_other: SE2
+    co_visible: int
+    pairs: IntArray | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AlignmentSequence:
+    """Frames of one pair of agents, 0.1 s apart."""
+
+    name: str
+    frames: list[PairFrame]
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What an aligner did in one frame. Errors are infinite where it refused; `seconds` is the call's duration."""
+
+    sequence: str
+    co_visible: int
+    accepted: bool
+    translation_error: float
+    yaw_error: float
+    landing_error: float
+    true_matches: int
+    found_matches: int
+    possible_matches: int
+    seconds: float
+
+    @property
+    def right(self) -> bool:
+        """Accepted, and other's boxes land within 3 m on average of where they should."""
+        return self.accepted and self.landing_error < RIGHT
+
+    def success(self, k: float) -> bool:
+        """Accepted, within k metres and k degrees."""
+        return self.accepted and self.translation_error < k and self.yaw_error < math.radians(k)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Shares over a set of frames; NaN where there are none to divide by."""
+
+    frames: int
+    right: float
+    refused: float
+    wrong_of_accepted: float
+    success_1: float
+    success_2: float
+    success_3: float
+    match_precision: float
+    match_recall: float
+    median_milliseconds: float
+
+
+def landing_error(estimate: SE2, truth: SE2, other: Boxes) -> float:
+    """Mean distance between other's boxes placed by two poses [m]; at its origin when it has no boxes."""
+    points = other.center[:, :2] if len(other) else np.zeros((1, 2))
+    gap = estimate.apply(points) - truth.apply(points)
+    return float(np.hypot(gap[:, 0], gap[:, 1]).mean())
+
+
+def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], Aligner]) -> Iterator[Record]:
+    """Run a fresh aligner over every sequence, in order."""
+    for sequence in sequences:
+        aligner = make_aligner()
+        for frame in sequence.frames:
+            start = time.perf_counter()
+            alignment = aligner.align(frame.ego, frame.other)
+            seconds = time.perf_counter() - start
+            translation = yaw = landing = math.inf
+            if alignment.ego_SE2_other is not None:
+                translation, yaw = alignment.ego_SE2_other.error_to(frame.ego_SE2_other)
+                landing = landing_error(alignment.ego_SE2_other, frame.ego_SE2_other, frame.other)
+            true, possible = _count_matches(alignment.matches, frame.pairs)
+            yield Record(
+                sequence.name,
+                frame.co_visible,
+                alignment.accepted,
+                translation,
+                yaw,
+                landing,
+                true,
+                len(alignment.matches) if frame.pairs is not None else 0,
+                possible if alignment.accepted else 0,
+                seconds,
+            )
+
+
+def _count_matches(found: IntArray, pairs: IntArray | None) -> tuple[int, int]:
+    """How many of the found matches are true, and how many true ones there are."""
+    if pairs is None:
+        return 0, 0
+    truth = set(map(tuple, pairs.tolist()))
+    return sum(pair in truth for pair in map(tuple, found.tolist())), len(truth)
+
+
+def summarise(records: Iterable[Record], wrong: Callable[[Record], bool] = lambda r: not r.right) -> Summary:
+    """Shares over these frames.
+
+    Args:
+        records: of the frames to count.
+        wrong: what makes an accepted alignment a wrong one; by default a landing error of 3 m or more.
+    """
+    rows = list(records)
+    accepted = [r for r in rows if r.accepted]
+
+    def share(part: float, whole: float) -> float:
+        return part / whole if whole else math.nan
+
+    n = len(rows)
+    true = sum(r.true_matches for r in rows)
+    return Summary(
+        frames=n,
+        right=share(sum(r.right for r in rows), n),
+        refused=share(n - len(accepted), n),
+        wrong_of_accepted=share(sum(wrong(r) for r in accepted), len(accepted)),
+        success_1=share(sum(r.success(1.0) for r in rows), n),
+        success_2=share(sum(r.success(2.0) for r in rows), n),
+        success_3=share(sum(r.success(3.0) for r in rows), n),
+        match_precision=share(true, sum(r.found_matches for r in rows)),
+        match_recall=share(true, sum(r.possible_matches for r in rows)),
+        median_milliseconds=1e3 * float(np.median([r.seconds for r in rows])) if rows else math.nan,
+    )
