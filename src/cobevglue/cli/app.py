@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -94,7 +93,3 @@ def _usage_message(error: Exception) -> str:
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "cobevglue"
     return f"{message.rstrip('.')}; see '{command} --help'"
-
-
-if __name__ == "__main__":
-    sys.exit(main())
