@@ -64,7 +64,10 @@ def _draw_together(axes: Axes, ego: Boxes, other: Boxes, alignment: Alignment, e
     if pose is None:
         style_bev(axes, "3  Refused: no pose, nothing is moved")
         reason = textwrap.fill(alignment.reason, 46)
-        axes.text(0.03, 0.97, reason, transform=axes.transAxes, ha="left", va="top", fontsize=11.0)
+        frame = {"facecolor": "white", "edgecolor": "#999999", "boxstyle": "round,pad=0.4"}
+        axes.text(
+            0.03, 0.97, reason, transform=axes.transAxes, ha="left", va="top", fontsize=11.0, bbox=frame, zorder=9.0
+        )
         return
     where = f"x {pose.x:.1f} m, y {pose.y:.1f} m, yaw {math.degrees(wrap_angle(pose.yaw)):.1f}°"
     style_bev(axes, f"3  Together: {where}")
