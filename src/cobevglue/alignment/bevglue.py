@@ -166,22 +166,24 @@ class _EvidenceMatcher:
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0)
         best = self._hypotheses[0]
         evidence = float(best["evidence"])
-        reason = self._doubt(len(pairs), evidence, margin, landing_std) if self._config.verdict else ""
+        choices = len(ego) * len(other)
+        reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
         if reason:
             return Alignment.refused(reason, evidence, margin)
         pose, covariance = _pose_at_origin(best)
         return Alignment(pose, pairs, covariance, "", evidence, margin)
 
-    def _doubt(self, pairs: int, evidence: float, margin: float, landing_std: float) -> str:
+    def _doubt(self, pairs: int, choices: int, evidence: float, margin: float, landing_std: float) -> str:
         """Why the best pose should not be trusted, or an empty string."""
         config = self._config
-        needed = max(config.min_margin, config.min_relative_margin * evidence)
         if pairs == 0:
             return "no object in this frame supports the pose followed so far"
-        if evidence < config.min_evidence:
-            return f"too few common objects: evidence {evidence:.1f} nats, {config.min_evidence:.1f} needed"
-        if margin < needed:
-            return f"ambiguous: a different pose is only {margin:.1f} nats behind, {needed:.1f} needed"
+        least = config.min_evidence + config.min_evidence_per_choice * math.log(max(choices / 25.0, 1.0))
+        if evidence < least:
+            return f"too few common objects: evidence {evidence:.1f} nats, {least:.1f} needed"
+        least = max(config.min_margin, config.min_relative_margin * evidence)
+        if margin < least:
+            return f"ambiguous: a different pose is only {margin:.1f} nats behind, {least:.1f} needed"
         if landing_std > config.max_landing_std:
             return f"too uncertain: boxes would land within {landing_std:.1f} m, {config.max_landing_std:.1f} m allowed"
         return ""
