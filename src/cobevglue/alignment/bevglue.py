@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -148,7 +147,7 @@ class _EvidenceMatcher:
     def align(self, ego: Boxes, other: Boxes, dt: float) -> Alignment:
         if not self._config.temporal:
             self.reset()
-        self._hypotheses, margin, landing_std, pairs = self._kernels.advance(
+        self._hypotheses, margin, landing_std, pairs, x, y, yaw, covariance = self._kernels.advance(
             self._hypotheses,
             _bev_rows(ego),
             _bev_rows(other),
@@ -164,14 +163,12 @@ class _EvidenceMatcher:
         self._seen += 1
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0)
-        best = self._hypotheses[0]
-        evidence = float(best["evidence"])
+        evidence = float(self._hypotheses[0]["evidence"])
         choices = len(ego) * len(other)
         reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
         if reason:
             return Alignment.refused(reason, evidence, margin)
-        pose, covariance = _pose_at_origin(best)
-        return Alignment(pose, pairs, covariance, "", evidence, margin)
+        return Alignment(SE2(x, y, yaw), pairs, covariance, "", evidence, margin)
 
     def _doubt(self, pairs: int, choices: int, evidence: float, margin: float, landing_std: float) -> str:
         """Why the best pose should not be trusted, or an empty string."""
@@ -206,17 +203,6 @@ def _nothing_in_common(ego: Boxes, other: Boxes) -> str:
     if len(ego) == 0 or len(other) == 0:
         return f"{'ego' if len(ego) == 0 else 'other'} sees no object"
     return "no two boxes are similar enough to be one object"
-
-
-def _pose_at_origin(hypothesis: Any) -> tuple[SE2, FloatArray]:
-    """A hypothesis' pose and (3, 3) covariance, moved from its pivot to the origin of other's frame."""
-    yaw = float(hypothesis["yaw"])
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    px, py = float(hypothesis["other_x"]), float(hypothesis["other_y"])
-    rx, ry = cos * px - sin * py, sin * px + cos * py
-    pose = SE2(float(hypothesis["ego_x"]) - rx, float(hypothesis["ego_y"]) - ry, yaw)
-    lever = np.array([[1.0, 0.0, ry], [0.0, 1.0, -rx], [0.0, 0.0, 1.0]])
-    return pose, lever @ hypothesis["cov"][:3, :3] @ lever.T
 
 
 def _fit_covariance(arms: FloatArray, position_std: float) -> FloatArray:

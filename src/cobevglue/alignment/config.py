@@ -1,7 +1,7 @@
 """Settings of BEVGlue. Every number here is ours: the paper's are in an appendix that is not public.
 
-The robust variant's noise and motion model were chosen by random search on the V2V4Real `train` detection sequences moved
-along several smooth drives; the least evidence by what unrelated frames reach (ego of one such sequence with other of
+The noise and motion model of the robust variant were chosen by random search on the V2V4Real `train` detections,
+moved along several smooth drives; the least evidence by what unrelated frames reach (ego of one such sequence with other of
 another); how fast the relative yaw may change also by the simulated junction, where agents turn. `val` took no part.
 OPV2V labels did in one way: that evidence must grow with the number of boxes was noticed on them.
 """
@@ -126,7 +126,7 @@ class BEVGlueConfig(BaseModel):
     min_evidence_per_choice: _NotNegative = 4.0
     max_landing_std: _Positive = 1.4
 
-    tries: Annotated[int, Field(ge=1)] = 8
+    tries: Annotated[int, Field(ge=1)] = 6
     rounds: Annotated[int, Field(ge=1)] = 2
     max_gap: _Positive = 2.0
 

@@ -23,9 +23,9 @@ from cobevglue.alignment.pose_search import STAR, add_star, copy_pairs, fit_pose
 
 __all__ = ["HYPOTHESIS", "Motion", "NoiseModel", "advance"]
 
-_MOST_TRACK_PAIRS = 32
+_MOST_TRACK_PAIRS = 16
 """Track pairs a hypothesis remembers."""
-_MOST_HYPOTHESES = 8
+_MOST_HYPOTHESES = 6
 _FORGOTTEN = 0.3
 """A hypothesis that nothing agreed with is dropped below this evidence [nats]."""
 _SURPRISE = 2.0
@@ -211,6 +211,23 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def _at_origin(h):
+    """x, y, yaw and their (3, 3) covariance at the origin of other's frame instead of the pivot."""
+    cos, sin = math.cos(h.yaw), math.sin(h.yaw)
+    rx, ry = cos * h.other_x - sin * h.other_y, sin * h.other_x + cos * h.other_y
+    covariance = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = h.cov[i, j]
+    for i, factor in ((0, ry), (1, -rx)):
+        for j in range(3):
+            covariance[i, j] += factor * covariance[2, j]
+        for j in range(3):
+            covariance[j, i] += factor * covariance[j, 2]
+    return h.ego_x - rx, h.ego_y - ry, h.yaw, covariance
+
+
+@njit(cache=True, error_model="numpy")
 def _landing_std(h, other) -> float:
     """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
     total = 0.0
@@ -239,8 +256,8 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
 
     Returns:
         The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the
-        standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; and the (K, 2)
-        rows of ego and other that it matches in this frame.
+        standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
+        of ego and other that it matches in this frame; and its x, y and yaw with their (3, 3) covariance.
     """
     steps = dt / _STEP
     memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
@@ -334,5 +351,9 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
     matched = np.empty((ranked[0].pairs if 0 <= best_star < count else 0, 2), np.int64)
     if len(matched):
         copy_pairs(matched, rows[best_star], len(matched))
-    landing = _landing_std(ranked[0], other) if len(ranked) else np.inf
-    return ranked, margin, landing, matched
+    if len(ranked) == 0:
+        return ranked, margin, np.inf, matched, 0.0, 0.0, 0.0, np.zeros((3, 3))
+    best_hypothesis = ranked[0]
+    landing = _landing_std(best_hypothesis, other)
+    x, y, yaw, covariance = _at_origin(best_hypothesis)
+    return ranked, margin, landing, matched, x, y, yaw, covariance

@@ -49,7 +49,7 @@ _HEADING_WEIGHT = 0.67
 _SEED_HEADING_STD = math.radians(4.0)
 _SEED_HEADING_GAIN = 1.6
 """Evidence of a perfect heading agreement, as a ratio: what `pair_evidence` gives at zero difference, rounded."""
-_SEED_PAIRS = 1600
+_SEED_PAIRS = 900
 """Above this many pairs only the boxes of other with the rarest sizes seed stars (never fewer than `_FEWEST_SEEDS`)."""
 _FEWEST_SEEDS = 24
 _LEAVES = 16
@@ -383,6 +383,9 @@ def search(ego, other, sizes, noise, tries, rounds, stars, rows):
     """
     score, seed = _score_seeds(ego, other, sizes, noise)
     star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
+    partner = np.empty(len(ego), np.int64)
+    for m in range(len(ego)):
+        partner[m] = -1
     count = 0
     for _ in range(min(tries, len(score))):
         best = 0
@@ -400,12 +403,15 @@ def search(ego, other, sizes, noise, tries, rounds, stars, rows):
         if star.pairs == 0:
             continue
         star.yaw = wrap(star.yaw)
+        for k in range(star.pairs):
+            partner[pairs[k, 0]] = pairs[k, 1]
         for i in range(len(score)):
-            turn = ego[seed[i, 0], YAW] - other[seed[i, 1], YAW] + math.pi * seed[i, 2] - star.yaw
-            if score[i] > -np.inf and abs(wrap(turn)) < _SAME_SEED_ANGLE:
-                for k in range(star.pairs):
-                    if pairs[k, 0] == seed[i, 0] and pairs[k, 1] == seed[i, 1]:
-                        score[i] = -np.inf
-                        break
+            m, n = seed[i, 0], seed[i, 1]
+            if partner[m] == n:
+                turn = ego[m, YAW] - other[n, YAW] + math.pi * seed[i, 2] - star.yaw
+                if abs(wrap(turn)) < _SAME_SEED_ANGLE:
+                    score[i] = -np.inf
+        for k in range(star.pairs):
+            partner[pairs[k, 0]] = -1
         count = add_star(stars, rows, count, star, pairs)
     return count
