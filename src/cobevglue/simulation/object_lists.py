@@ -75,7 +75,7 @@ class AgentView:
     boxes: Boxes
     object_id: IntArray
     visible: Boxes
-    world_SE2_agent: SE2  # noqa: N815
+    world_SE2_agent: SE2
     own_id: int
 
 
