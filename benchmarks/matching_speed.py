@@ -4,9 +4,9 @@
 
 One core; the calls include everything that Python does around the kernels. *First* is a call on a fresh BEVGlue,
 *following* one that also carries hypotheses from the frame before. The star search is the paper's matcher written in
-plain NumPy (`BEVGlueConfig.paper()`, first frame: all pairs seed), vectorised over the pairs that may join a star. Scenes
-are seeded: boxes spread like traffic, two thirds of them common, 0.3 m and 3 degrees of noise.
-"""
+*following* one that also carries hypotheses from the frame before. The star search is the paper's matcher in plain NumPy
+(`BEVGlueConfig.paper()`, first frame: all pairs seed), vectorised over the pairs that may join a star. Scenes are
+seeded: boxes spread like traffic, two thirds of them common, 0.3 m and 3 degrees of noise.
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ STAR_SEARCH_UP_TO = 40
 def main() -> None:
     """Print the table."""
     print(
-        f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seed 0; milliseconds, fastest | median\n"
+    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seed 0")
+    print("milliseconds, fastest | median\n")
     )
     print("| boxes each | first | following | NumPy star search | ratio of the medians, first |\n|" + " --- |" * 5)
     for count in COUNTS:
