@@ -3,10 +3,10 @@
     python benchmarks/matching_speed.py
 
 One core; the calls include everything that Python does around the kernels. *First* is a call on a fresh BEVGlue,
-*following* one that also carries hypotheses from the frame before. The star search is the paper's matcher written in
-*following* one that also carries hypotheses from the frame before. The star search is the paper's matcher in plain NumPy
+*following* one that also carries hypotheses from the frame before. The star search is the paper's matcher in NumPy
 (`BEVGlueConfig.paper()`, first frame: all pairs seed), vectorised over the pairs that may join a star. Scenes are
 seeded: boxes spread like traffic, two thirds of them common, 0.3 m and 3 degrees of noise.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +28,8 @@ STAR_SEARCH_UP_TO = 40
 
 def main() -> None:
     """Print the table."""
-    print(
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seed 0")
     print("milliseconds, fastest | median\n")
-    )
     print("| boxes each | first | following | NumPy star search | ratio of the medians, first |\n|" + " --- |" * 5)
     for count in COUNTS:
         ego, other = scene(count, seed=0)
