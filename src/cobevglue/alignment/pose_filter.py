@@ -30,6 +30,8 @@ _FORGOTTEN = 0.3
 """A hypothesis that nothing agreed with is dropped below this evidence [nats]."""
 _SURPRISE = 2.0
 """Mean squared innovation, in standard deviations, above which a hypothesis' covariance is inflated."""
+_FEWEST_TO_OVERRULE = 4
+"""Pairs that it takes for that."""
 _STEP = 0.1
 """Memory is configured per frame of this length [s]."""
 _SAME_DISTANCE, _SAME_ANGLE = 2.0, math.radians(8.0)
@@ -135,8 +137,9 @@ def _correct(h, star, correlation) -> None:
     surprise = 0.0
     for i in range(3):
         surprise += innovation[i] ** 2 / (cov[i, i] + variance[i]) / 3.0
-    if surprise > _SURPRISE:
-        # The motion model is wrong at the moment (braking, steering): believe what is seen.
+    if surprise > _SURPRISE and star.pairs >= _FEWEST_TO_OVERRULE:
+        # The motion model is wrong at the moment (braking, steering): believe what is seen. Of two or three pairs one
+        # may be a coincidence, which must not turn a pose that was right.
         for i in range(6):
             for j in range(6):
                 cov[i, j] *= surprise / _SURPRISE
@@ -293,23 +296,21 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
                     merged = True
                 elif claimed < 0 or stars[s].evidence > stars[claimed].evidence:
                     claimed = s
-        if motion.use_tracks and h.tracked_pairs >= 2 and (claimed < 0 or stars[claimed].pairs < h.tracked_pairs):
+        if motion.use_tracks and h.tracked_pairs >= 2 and claimed < 0 and not merged:
             # A frame that jumped (dropped frames, a sudden turn) is still tied down by what both go on tracking.
             star.pairs = _surviving_pairs(h, ego_ids, other_ids, pairs)
-            if star.pairs >= 2 and (claimed < 0 or star.pairs > stars[claimed].pairs):
+            if star.pairs >= 2:
                 star.yaw = h.yaw
                 fit_pose(ego, other, star, pairs, noise)
-                best = claimed
                 for s in range(count):
                     if (
                         owner[s] < 0
                         and same_pose(stars[s], star, motion.link_distance, motion.link_angle)
-                        and (best < 0 or stars[s].evidence > stars[best].evidence)
+                        and (claimed < 0 or stars[s].evidence > stars[claimed].evidence)
                     ):
-                        best = s
-                if best != claimed:
-                    claimed = best
-                    jumped[best] = True
+                        claimed = s
+                if claimed >= 0:
+                    jumped[claimed] = True
         if claimed >= 0:
             owner[claimed] = i
         elif not merged:

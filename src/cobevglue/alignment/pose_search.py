@@ -44,6 +44,8 @@ STAR = np.dtype(
 
 _GATE = 3.0
 """A pair farther apart than this many standard deviations is not a match."""
+_SAME_VEHICLE = 1.0
+"""Centres of two vehicles are farther apart than this [m]."""
 _HEADING_WEIGHT = 0.67
 """Headings enter the fit with their noise widened by 1/0.67: their errors within a frame are not independent."""
 _SEED_HEADING_STD = math.radians(4.0)
@@ -117,8 +119,16 @@ def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     kept, total = 0, 0.0
     for i in range(found):
         m, n = row[i, 0], row[i, 1]
-        if (noise.one_to_one and (ego_taken[m] or other_taken[n])) or kept == len(pairs):
-            continue
+        if kept == len(pairs):
+            break
+        if noise.one_to_one:
+            repeated = ego_taken[m] or other_taken[n]
+            for k in range(kept):
+                # Two boxes in one place are one vehicle detected twice: its evidence counts once.
+                dx, dy = ego[pairs[k, 0], X] - ego[m, X], ego[pairs[k, 0], Y] - ego[m, Y]
+                repeated = repeated or dx * dx + dy * dy < _SAME_VEHICLE**2
+            if repeated:
+                continue
         ego_taken[m] = other_taken[n] = True
         pairs[kept, 0] = m
         pairs[kept, 1] = n
