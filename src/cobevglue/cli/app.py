@@ -14,6 +14,7 @@ from cobevglue.cli.align import align
 from cobevglue.cli.bench import bench
 from cobevglue.cli.demo import demo
 from cobevglue.cli.errors import InputError
+from cobevglue.cli.evaluate import evaluate
 from cobevglue.cli.output import print_note
 from cobevglue.cli.simulate import simulate
 
@@ -40,7 +41,7 @@ def _reflowed(text: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n"))
 
 
-for _command in (demo, align, simulate, bench):
+for _command in (demo, align, simulate, evaluate, bench):
     app.command(help=_reflowed(_command.__doc__ or ""))(_command)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +21,23 @@ from cobevglue.boxes import Boxes
 from cobevglue.se2 import SE2
 from cobevglue.typing import IntArray
 
-__all__ = ["AlignmentSequence", "PairFrame", "Record", "Summary", "evaluate", "landing_error", "summarise"]
+__all__ = [
+    "AlignmentSequence",
+    "PairFrame",
+    "Record",
+    "Summary",
+    "by_co_visible",
+    "evaluate",
+    "landing_error",
+    "off_by_3",
+    "summarise",
+]
 
 RIGHT = 3.0
 """Landing error of a right pose [m]."""
+
+_GROUPS = {"all": (0, None), "0": (0, 0), "1": (1, 1), "2": (2, 2), "3": (3, 3), ">= 2": (2, None), ">= 4": (4, None)}
+"""Numbers of co-visible objects that are reported apart: first and last."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -164,3 +177,20 @@ def summarise(records: Iterable[Record], wrong: Callable[[Record], bool] = lambd
         match_recall=share(true, sum(r.possible_matches for r in rows)),
         median_milliseconds=1e3 * float(np.median([r.seconds for r in rows])) if rows else math.nan,
     )
+
+
+def off_by_3(record: Record) -> bool:
+    """The stricter meaning of wrong, for exact ground truth: beyond 3 m or 3 degrees."""
+    return not record.success(3.0)
+
+
+def by_co_visible(
+    records: Sequence[Record], wrong: Callable[[Record], bool] = lambda r: not r.right
+) -> dict[str, Summary]:
+    """A summary for each group of frames by their number of co-visible objects; groups without frames are left out."""
+    groups = {}
+    for name, (first, last) in _GROUPS.items():
+        part = [r for r in records if r.co_visible >= first and (last is None or r.co_visible <= last)]
+        if part:
+            groups[name] = summarise(part, wrong)
+    return groups

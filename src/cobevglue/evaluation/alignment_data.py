@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cobevglue.boxes import Boxes
-from cobevglue.datasets.opv2v import OPV2V
+from cobevglue.datasets import Dataset, Scenario
 from cobevglue.datasets.tracking_text import count_frames, read_v2v4real_detections, read_v2v4real_labels
 from cobevglue.disturbance.detection_errors import DetectionErrors, add_detection_errors
 from cobevglue.evaluation.alignment import AlignmentSequence, PairFrame
@@ -22,7 +23,7 @@ from cobevglue.se2 import SE2
 from cobevglue.tracking import Sort
 from cobevglue.typing import IntArray
 
-__all__ = ["V2V4REAL_TRAIN", "V2V4REAL_VAL", "opv2v_sequences", "smooth_drive", "v2v4real_sequences"]
+__all__ = ["V2V4REAL_TRAIN", "V2V4REAL_VAL", "noisy_label_sequences", "smooth_drive", "v2v4real_sequences"]
 
 V2V4REAL_TRAIN = tuple(f"train/{i:04d}" for i in range(1, 11))
 """Detection sequences the defaults were tuned on; train/0000 is val/0000 again and is left out."""
@@ -33,6 +34,8 @@ _FRAME = 0.1
 _DETECTED_WITHIN, _DETECTED_TURN = 2.5, math.radians(30.0)
 """A detection is of a labelled object when this close [m] and, modulo pi, this well turned [rad]."""
 _DRIVE_STREAM, _ERROR_STREAM = 0, 1
+_FALSE = np.iinfo(np.int64).min
+"""Object id of a false box; no data set uses it."""
 
 
 def smooth_drive(seed: int, frames: int) -> list[SE2]:
@@ -99,38 +102,49 @@ def _detected(labels: Boxes, detections: Boxes) -> IntArray:
     return found
 
 
-def opv2v_sequences(
-    root: Path, split: str, errors: DetectionErrors, seed: int = 0, max_range: float = math.inf
-) -> list[AlignmentSequence]:
-    """Every pair of agents of OPV2V scenarios, with a detector's errors added to the labels and tracks on top.
+def noisy_label_sequences(
+    dataset: Dataset, errors: DetectionErrors, seed: int = 0, max_range: float = math.inf
+) -> Iterator[AlignmentSequence]:
+    """Every pair of agents of every scenario, with a detector's errors added to the labels and tracks on top.
 
     Args:
-        root: the data set.
-        split: such as "test_culvercity".
+        dataset: one whose object ids are the same for all agents (OPV2V, V2XSet).
         errors: what the detectors do wrong.
         seed: of the errors.
         max_range: objects farther from an agent are not detected [m].
     """
-    sequences = []
-    for index, scenario in enumerate(OPV2V(root, split)):
-        first = scenario[0]
-        for ego_name, other_name in itertools.combinations(sorted(first.agents), 2):
-            frames, trackers = [], (Sort(), Sort())
+    for index, scenario in enumerate(dataset):
+        names = sorted({name for frame in scenario for name in frame.agents})
+        seen = [
+            _detect(scenario, name, errors, [seed, _ERROR_STREAM, index, j], max_range) for j, name in enumerate(names)
+        ]
+        for a, b in itertools.combinations(range(len(names)), 2):
+            frames = []
             for i, frame in enumerate(scenario):
-                if ego_name not in frame.agents or other_name not in frame.agents:
-                    continue
-                seen, ids = [], []
-                for j, name in enumerate((ego_name, other_name)):
-                    agent = frame.agents[name]
-                    near = agent.objects[np.hypot(agent.objects.center[:, 0], agent.objects.center[:, 1]) < max_range]
-                    rng = np.random.default_rng([seed, _ERROR_STREAM, index, i, sorted(first.agents).index(name)])
-                    boxes, rows = add_detection_errors(near, errors, rng)
-                    assert near.track_id is not None, "OPV2V objects have ids"
-                    ids.append(np.where(rows >= 0, near.track_id[rows] if len(near) else -1, -1))
-                    seen.append(trackers[j].update(boxes))
-                ego, other = frame.agents[ego_name], frame.agents[other_name]
-                truth = SE2.from_matrix(np.linalg.inv(ego.world_SE3_lidar) @ other.world_SE3_lidar)
-                pairs = np.argwhere((ids[0][:, None] == ids[1][None, :]) & (ids[0][:, None] >= 0))
-                frames.append(PairFrame(seen[0], seen[1], truth, len(pairs), pairs))
-            sequences.append(AlignmentSequence(f"{scenario.name}/{ego_name}-{other_name}", frames))
-    return sequences
+                if i in seen[a] and i in seen[b]:
+                    (ego, ego_ids), (other, other_ids) = seen[a][i], seen[b][i]
+                    world_SE3_ego, world_SE3_other = (frame.agents[names[k]].world_SE3_lidar for k in (a, b))
+                    truth = SE2.from_matrix(np.linalg.inv(world_SE3_ego) @ world_SE3_other)
+                    pairs = np.argwhere((ego_ids[:, None] == other_ids[None, :]) & (ego_ids[:, None] != _FALSE))
+                    frames.append(PairFrame(ego, other, truth, len(pairs), pairs))
+            yield AlignmentSequence(f"{scenario.name}/{names[a]}-{names[b]}", frames)
+
+
+def _detect(
+    scenario: Scenario, name: str, errors: DetectionErrors, key: list[int], max_range: float
+) -> dict[int, tuple[Boxes, IntArray]]:
+    """Tracked noisy boxes of one agent and their true object ids (`_FALSE` for false boxes), by frame number."""
+    tracker, seen = Sort(), {}
+    for i, frame in enumerate(scenario):
+        if name not in frame.agents:
+            continue
+        objects = frame.agents[name].objects
+        objects = objects[np.hypot(objects.center[:, 0], objects.center[:, 1]) < max_range]
+        if objects.track_id is None and len(objects):
+            raise ValueError(f"{scenario.name}: {name}: objects have no ids, so what both agents see is not known")
+        boxes, rows = add_detection_errors(objects, errors, np.random.default_rng([*key, i]))
+        ids = np.full(len(rows), _FALSE)
+        if objects.track_id is not None:
+            ids[rows >= 0] = objects.track_id[rows[rows >= 0]]
+        seen[i] = tracker.update(boxes), ids
+    return seen
