@@ -24,10 +24,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import SE2, wrap_angle
+from cobevglue.settings import Settings
 from cobevglue.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["Sort", "SortConfig", "Tracks"]
@@ -50,7 +51,7 @@ _HEADING_GAIN, _SHAPE_GAIN, _FRONT_GAIN = 0.5, 0.3, 0.2
 """Shares of a new detection in a track's heading, its size and height, and the vote on which end is the front."""
 
 
-class SortConfig(BaseModel):
+class SortConfig(Settings):
     """Settings of `Sort`. CoBEVGlue's paper gives none: these are ours, chosen on V2V4Real's training sequences.
 
     `benchmarks/tracking.py` measures them: without `frame_motion` an object changes its identity twice as often, more
@@ -76,8 +77,6 @@ class SortConfig(BaseModel):
     Raises:
         ValueError: a value out of range or an unknown field; names the field.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     affinity: Literal["distance", "giou"] = "giou"
     max_distance: float = Field(default=4.5, gt=0, allow_inf_nan=False)

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from cobevglue.settings import Settings
 
 __all__ = ["AffinityConfig", "BEVGlueConfig"]
 
@@ -20,7 +22,7 @@ _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 _Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
-class AffinityConfig(BaseModel):
+class AffinityConfig(Settings):
     """Affinity functions and thresholds of the paper's own matcher (section 4.2), our fill-ins.
 
     Node affinity is exp(-(dl/length_scale)^2 - (dw/width_scale)^2), edge affinity exp(-(g/position_scale)^2 -
@@ -35,8 +37,6 @@ class AffinityConfig(BaseModel):
         edge_threshold: gamma_E; a pair of edges with a lower affinity is never matched.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     length_scale: _Positive = 1.5
     width_scale: _Positive = 0.5
     position_scale: _Positive = 2.0
@@ -45,7 +45,7 @@ class AffinityConfig(BaseModel):
     edge_threshold: _Share = 0.3
 
 
-class BEVGlueConfig(BaseModel):
+class BEVGlueConfig(Settings):
     """Settings of `BEVGlue`. The defaults are the robust variant; `BEVGlueConfig.paper()` follows the text literally.
 
     Attributes:
@@ -89,8 +89,6 @@ class BEVGlueConfig(BaseModel):
     Raises:
         ValueError: a value out of its range or an unknown field.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: Literal["evidence", "affinity"] = "evidence"
     range_tolerance: bool = True

@@ -6,10 +6,11 @@ import math
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import wrap_angle
+from cobevglue.settings import Settings
 from cobevglue.typing import FloatArray, IntArray
 
 __all__ = ["DetectionErrors", "add_detection_errors"]
@@ -25,7 +26,7 @@ _SMALLEST_SIZE_FACTOR = 0.5
 """Size noise never shrinks a box below this fraction of its true size, so that sizes stay valid."""
 
 
-class DetectionErrors(BaseModel):
+class DetectionErrors(Settings):
     """How far a detector's boxes are from the truth. The defaults resemble a PointPillars detector on cars.
 
     Attributes:
@@ -43,8 +44,6 @@ class DetectionErrors(BaseModel):
     Raises:
         ValueError: a negative spread, a probability outside [0, 1], or an unknown field.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     center_std: _Spread = 0.2
     center_std_per_m: _Spread = 0.004

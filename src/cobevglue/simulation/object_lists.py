@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cobevglue.boxes import Boxes
 from cobevglue.disturbance.detection_errors import DetectionErrors, add_detection_errors
 from cobevglue.se2 import SE2
+from cobevglue.settings import Settings
 from cobevglue.simulation.scripted_traffic import place_traffic
 from cobevglue.simulation.visibility import is_visible
 from cobevglue.typing import IntArray
@@ -33,7 +34,7 @@ _FIRST_DETECTION_STREAM = 1  # and one stream more for each agent after the firs
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class JunctionSettings(BaseModel):
+class JunctionSettings(Settings):
     """What the junction is like.
 
     Attributes:
@@ -48,8 +49,6 @@ class JunctionSettings(BaseModel):
     Raises:
         ValueError: a value out of its range, an unknown field, or fewer vehicles than agents.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     agents: Annotated[int, Field(ge=1, le=8)] = 2
     vehicles: Annotated[int, Field(ge=1, le=100)] = 32
