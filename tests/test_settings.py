@@ -27,4 +27,4 @@ def test_an_unknown_name_gets_the_nearest_valid_one(settings: type[Settings], wr
 
 def test_settings_do_not_change() -> None:
     with pytest.raises(ValueError, match="frozen"):
-            BEVGlueConfig().tries = 3
+        BEVGlueConfig().tries = 3
