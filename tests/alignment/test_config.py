@@ -47,7 +47,7 @@ def test_a_value_out_of_its_range_is_an_error_that_names_the_field(field: str, v
 
 
 def test_affinities_are_settings_of_their_own() -> None:
-    with pytest.raises(ValidationError, match=r"affinity\.gamma"):
+    with pytest.raises(ValidationError, match="AffinityConfig has no setting 'gamma'"):
         BEVGlueConfig.model_validate({"affinity": {"gamma": 0.5}})
     assert BEVGlueConfig.model_validate({"affinity": {"node_threshold": 0.5}}).affinity.node_threshold == 0.5
 
