@@ -121,7 +121,7 @@ class BEVGlueConfig(Settings):
     min_margin: _NotNegative = 4.0
     min_relative_margin: _NotNegative = 0.25
     min_evidence: _NotNegative = 8.0
-    min_evidence_per_choice: _NotNegative = 4.0
+    min_evidence_per_choice: _NotNegative = 5.0
     max_landing_std: _Positive = 1.4
 
     tries: Annotated[int, Field(ge=1)] = 6
