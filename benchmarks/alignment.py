@@ -1,8 +1,9 @@
 """How often BEVGlue finds two agents' relative pose, how often it is wrong, and what each of its options is worth.
 
-    python benchmarks/alignment.py                      # everything below, about 5 minutes on two cores
+    python benchmarks/alignment.py                      # everything below, about 10 minutes
     python benchmarks/alignment.py --only v2v4real      # recorded detections of two real cars
     python benchmarks/alignment.py --only opv2v         # OPV2V labels with detection errors added
+    python benchmarks/alignment.py --only unrelated     # two agents that have nothing in common
     python benchmarks/alignment.py --only ablation      # each option of the default off, and the paper's own method
     python benchmarks/alignment.py --json results.json
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import platform
@@ -39,13 +41,13 @@ Table = list[dict[str, Any]]
 def main() -> None:
     """Print the tables and, on request, write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("v2v4real", "opv2v", "ablation"))
+    parser.add_argument("--only", choices=tuple(TABLES))
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     data = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seeds {SEEDS}\n")
     tables: dict[str, Table] = {}
-    for name, table in (("v2v4real", v2v4real), ("opv2v", opv2v), ("ablation", ablation)):
+    for name, table in TABLES.items():
         if arguments.only in (None, name):
             tables[name] = table(data)
             sys.stdout.flush()
@@ -76,6 +78,27 @@ def opv2v(data: Path) -> Table:
     for reach in (140.0, 50.0, 30.0):
         records = run(noisy_labels(data, reach), BEVGlue)
         table += rows(f"within {reach:.0f} m", records, wrong=off_by_3)
+    show(table)
+    return table
+
+
+def unrelated(data: Path) -> Table:
+    """Ego of one recorded sequence with other of another: everything that is accepted is wrong."""
+    print("## Unrelated agents (V2V4Real train: ego of one sequence, other of another)\n")
+    sequences = real_cars(data, V2V4REAL_TRAIN, SEEDS[:1])
+    records = []
+    for a, b in itertools.permutations(sequences, 2):
+        frames = [
+            dataclasses.replace(ego, other=other.other, co_visible=0)
+            for ego, other in zip(a.frames[:150], b.frames[-150:], strict=False)
+        ]
+        for frame, record in zip(frames, run([AlignmentSequence("unrelated", frames)], BEVGlue), strict=True):
+            records.append((len(frame.ego) * len(frame.other), record.accepted))
+    table: Table = []
+    for low, high in ((0, 24), (25, 99), (100, 224), (225, 9999), (0, 9999)):
+        accepted = [accepted for pairs, accepted in records if low <= pairs <= high]
+        share = sum(accepted) / len(accepted)
+        table.append({"pairs of boxes": f"{low} to {high}", "frames": len(accepted), "accepted": share})
     show(table)
     return table
 
@@ -142,6 +165,8 @@ def show(table: Table) -> None:
         print("| " + " | ".join(f"{cell:.4f}" if isinstance(cell, float) else str(cell) for cell in cells) + " |")
     print()
 
+
+TABLES = {"v2v4real": v2v4real, "opv2v": opv2v, "unrelated": unrelated, "ablation": ablation}
 
 if __name__ == "__main__":
     main()
