@@ -7,8 +7,8 @@
     python benchmarks/alignment.py --only ablation      # each option of the default off, and the paper's own method
     python benchmarks/alignment.py --json results.json
 
-The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`
-only; `val` and OPV2V confirm them. What "right", "wrong" and "success" mean: `cobevglue.evaluation.alignment`.
+The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`;
+`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. What "right", "wrong" and "success" mean: `cobevglue.evaluation.alignment`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def v2v4real(data: Path) -> Table:
         if names is V2V4REAL_VAL:
             accepted = sum(r.accepted for r in records if r.sequence == "val/0001")
             table.append({"what": "val/0001 (nothing co-visible): accepted", "frames": accepted})
-    everything = V2V4REAL_TRAIN + V2V4REAL_VAL + ("train/0000",)
+    everything = V2V4REAL_TRAIN + V2V4REAL_VAL + ("val/0000",)
     table += rows("all 16 sequences", run(real_cars(data, everything), BEVGlue))
     show(table)
     return table

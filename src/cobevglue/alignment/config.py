@@ -2,8 +2,11 @@
 
 The noise and motion model of the robust variant were chosen by random search on the V2V4Real `train` detections, moved
 along several smooth drives; the least evidence by what unrelated frames reach (ego of one of these sequences with other
-of another); how fast the relative yaw may change also by the simulated junction, where agents turn. `val` took no part.
-OPV2V labels did in one way: that evidence must grow with the number of boxes, and how fast, was seen on them, too.
+of another); how fast the relative yaw may change also by the simulated junction, where agents turn.
+
+What was not kept apart: while the method took shape (how near a star must be to continue a hypothesis, when a surprise
+may overrule it) results on `val` were in view beside those on `train`; and that evidence must grow with the number of
+boxes, and how fast, was seen on OPV2V labels, too. No number was searched for on either.
 """
 
 from __future__ import annotations

@@ -25,10 +25,10 @@ from cobevglue.typing import IntArray
 
 __all__ = ["V2V4REAL_TRAIN", "V2V4REAL_VAL", "noisy_label_sequences", "smooth_drive", "v2v4real_sequences"]
 
-V2V4REAL_TRAIN = tuple(f"train/{i:04d}" for i in range(1, 11))
-"""Detection sequences the defaults were tuned on; train/0000 is val/0000 again and is left out."""
-V2V4REAL_VAL = ("val/0000", "val/0001", "val/0004", "val/0005", "val/0008")
-"""Detection sequences that took no part in tuning."""
+V2V4REAL_TRAIN = tuple(f"train/{i:04d}" for i in range(11))
+"""Detection sequences the defaults were tuned on."""
+V2V4REAL_VAL = ("val/0001", "val/0004", "val/0005", "val/0008")
+"""Detection sequences that took no part in the numeric search; val/0000 is train/0000 again and is left out."""
 
 _FRAME = 0.1
 _DETECTED_WITHIN, _DETECTED_TURN = 2.5, math.radians(30.0)
