@@ -8,7 +8,8 @@
     python benchmarks/alignment.py --json results.json
 
 The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`;
-`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. What "right", "wrong" and "success" mean: `cobevglue.evaluation.alignment`.
+`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. What "right", "wrong" and "success"
+mean: `cobevglue.evaluation.alignment`.
 """
 
 from __future__ import annotations
