@@ -118,7 +118,7 @@ def test_a_junction_is_mostly_found_and_rarely_wrong() -> None:
         alignment = align(scene.ego, scene.other)
         accepted += alignment.accepted
         wrong += alignment.accepted and error_at(alignment.ego_SE2_other, scene.ego_SE2_other, scene.other) > 3.0
-    assert accepted > 0.6 * len(frames)
+    assert accepted > 0.5 * len(frames)
     assert wrong <= 0.05 * accepted
 
 
