@@ -179,7 +179,8 @@ class _EvidenceMatcher:
         least = config.min_evidence + config.min_evidence_per_choice * math.log(max(choices / 25.0, 1.0))
         if evidence < least:
             return f"too few common objects: evidence {evidence:.1f} nats, {least:.1f} needed"
-        least = max(config.min_margin, config.min_relative_margin * evidence)
+        # One frame cannot tell a regular pattern from the same one shifted; frames in which things move can.
+        least = max(config.min_margin, config.min_relative_margin * (1.0 + 1.0 / self._seen) * evidence)
         if margin < least:
             return f"ambiguous: a different pose is only {margin:.1f} nats behind, {least:.1f} needed"
         if landing_std > config.max_landing_std:

@@ -79,7 +79,8 @@ class BEVGlueConfig(Settings):
         link_distance: a star this near to a predicted pose (at its pivot) continues the hypothesis [m].
         link_angle: and this near in yaw [rad].
         min_margin: accept only if the evidence exceeds that of the best different pose by this much [nats] ...
-        min_relative_margin: ... and by this share of itself, so that a long row of equal gaps stays ambiguous.
+        min_relative_margin: ... and by this share of itself, so that a long row of equal gaps stays ambiguous; by twice
+            this share in the first frame, 1.5 times in the second, and so on.
         min_evidence: accept only above this evidence [nats]; one common object alone stays below it ...
         min_evidence_per_choice: ... and above this much more for each factor e by which the pairs to choose from exceed
             25, because the best of many chance agreements looks better than the best of few [nats].
