@@ -19,7 +19,18 @@ import numpy as np
 from numba import njit
 
 from cobevglue.alignment.evidence import NoiseModel, X, Y, size_evidence, wrap
-from cobevglue.alignment.pose_search import STAR, add_star, copy_pairs, fit_pose, most_pairs, refine, same_pose, search
+from cobevglue.alignment.pose_search import (
+    SAME_ANGLE,
+    SAME_DISTANCE,
+    STAR,
+    add_star,
+    copy_pairs,
+    fit_pose,
+    most_pairs,
+    refine,
+    same_pose,
+    search,
+)
 
 __all__ = ["HYPOTHESIS", "Motion", "NoiseModel", "advance"]
 
@@ -34,8 +45,6 @@ _FEWEST_TO_OVERRULE = 4
 """Pairs that it takes for that."""
 _STEP = 0.1
 """Memory is configured per frame of this length [s]."""
-_SAME_DISTANCE, _SAME_ANGLE = 2.0, math.radians(8.0)
-"""Poses that agree this closely at the pivot are not rivals [m, rad]."""
 
 HYPOTHESIS = np.dtype(
     [
@@ -346,7 +355,7 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
             best_star = best
     margin = ranked[0].evidence if len(ranked) else 0.0
     for i in range(1, len(ranked)):
-        if not same_pose(ranked[0], ranked[i], _SAME_DISTANCE, _SAME_ANGLE):
+        if not same_pose(ranked[0], ranked[i], SAME_DISTANCE, SAME_ANGLE):
             margin = ranked[0].evidence - ranked[i].evidence
             break
     matched = np.empty((ranked[0].pairs if 0 <= best_star < count else 0, 2), np.int64)

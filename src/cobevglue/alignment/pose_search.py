@@ -25,7 +25,19 @@ from numba import njit
 from cobevglue.alignment.evidence import YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
 from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["STAR", "add_star", "copy_pairs", "fit_pose", "match_boxes", "most_pairs", "refine", "same_pose", "search"]
+__all__ = [
+    "SAME_ANGLE",
+    "SAME_DISTANCE",
+    "STAR",
+    "add_star",
+    "copy_pairs",
+    "fit_pose",
+    "match_boxes",
+    "most_pairs",
+    "refine",
+    "same_pose",
+    "search",
+]
 
 STAR = np.dtype(
     [
@@ -60,7 +72,7 @@ _LEAST_SIZE_EVIDENCE = -3.0
 """Boxes of more different sizes than this do not seed a star."""
 _RASTER_CELL, _RASTER_REACH, _RASTER_MOST_CELLS = 1.5, 4.5, 256
 """Cell [m], how far from a box its cells reach [m], and cells per axis at most."""
-_SAME_DISTANCE, _SAME_ANGLE = 2.0, math.radians(8.0)
+SAME_DISTANCE, SAME_ANGLE = 2.0, math.radians(8.0)
 """Poses that agree this closely at the pivot are one hypothesis [m, rad]."""
 _SAME_SEED_ANGLE = 0.35
 """A matched pair whose headings turn by nearly the star's yaw would be refined to the same star again [rad]."""
@@ -215,11 +227,11 @@ def add_star(stars, rows, count, star, pairs) -> int:
     Of stars with one pose the best stays. The last record of `stars` is scratch and never filled.
     """
     for i in range(count):
-        if stars[i].evidence >= star.evidence and same_pose(stars[i], star, _SAME_DISTANCE, _SAME_ANGLE):
+        if stars[i].evidence >= star.evidence and same_pose(stars[i], star, SAME_DISTANCE, SAME_ANGLE):
             return count
     kept = 0
     for i in range(count):
-        if not same_pose(stars[i], star, _SAME_DISTANCE, _SAME_ANGLE):
+        if not same_pose(stars[i], star, SAME_DISTANCE, SAME_ANGLE):
             if kept < i:
                 stars[kept] = stars[i]
                 copy_pairs(rows[kept], rows[i], stars[i].pairs)
