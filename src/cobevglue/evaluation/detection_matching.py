@@ -1,0 +1,256 @@
+"""Which detection of a frame found which object, and what was missed or made up.
+
+*Counted*: an object of the truth that lies in the evaluation range (its centre; the borders belong to it) and has at
+least `min_points` points. All others are *ignored*: nobody has to find them, and finding them is no mistake. With
+`min_points=0` an object that no point hit counts as well. Detections whose centre is outside the range do not exist.
+
+*Matching*, one IoU threshold at a time: in falling order of score (equal scores in order of their rows), each detection
+takes the counted object it overlaps most among those not yet taken. It is *true* if that overlap (bird's-eye-view IoU)
+is at least the threshold; otherwise the object stays free for others. A detection that is not true but overlaps an
+ignored object by the threshold or more is *dropped*, as if it were not there; an ignored object can drop any number of
+them. What remains is *false*. A second detection of a counted object is therefore false.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.iou import bev_iou
+from cobevglue.typing import BoolArray, FloatArray, IntArray
+
+__all__ = [
+    "DROPPED",
+    "FALSE",
+    "DetectionFrame",
+    "EvaluationRange",
+    "Failure",
+    "Scene",
+    "find_failures",
+    "match",
+    "prepare",
+]
+
+EvaluationRange = tuple[float, float, float, float]
+"""x_min, x_max, y_min, y_max in the agent's LiDAR frame [m]."""
+
+FALSE, DROPPED = -1, -2
+"""In the place of a row of the truth: the detection found nothing, or does not count."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DetectionFrame:
+    """What one agent detected at one time, and the truth about it; all in the agent's LiDAR frame.
+
+    Attributes:
+        detections: N boxes with scores.
+        truth: K boxes; labels, where there are any, are reported apart.
+        point_count: (K,) how many points of the cloud lie in each object, or None where this is not known.
+        name: of the frame, for lists of failures and error messages.
+        agent: whose frame it is, for the same.
+        detection_point_count: (N,) how many points lie in each detection, or None.
+
+    Raises:
+        ValueError: detections without scores, or counts that do not fit; names the frame.
+    """
+
+    detections: Boxes
+    truth: Boxes
+    point_count: IntArray | None = None
+    name: str = ""
+    agent: str = ""
+    detection_point_count: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together."""
+        if self.detections.score is None and len(self.detections):
+            raise ValueError(f"{self._where}detections: score: average precision needs scores, got None")
+        for field, counts, boxes in (
+            ("point_count", self.point_count, self.truth),
+            ("detection_point_count", self.detection_point_count, self.detections),
+        ):
+            if counts is not None and np.shape(counts) != (len(boxes),):
+                raise ValueError(f"{self._where}{field} must have shape ({len(boxes)},), got {np.shape(counts)}")
+
+    @property
+    def _where(self) -> str:
+        return "".join(f"{part}: " for part in (self.name, self.agent) if part)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scene:
+    """A frame made ready for matching.
+
+    Attributes:
+        detections: N boxes inside the range, best score first, equal scores in their order of before.
+        rows: (N,) their rows in the frame's detections.
+        score: (N,) their scores.
+        truth: K boxes.
+        counted: (K,) which of them count.
+        iou: (N, K) overlap seen from above.
+    """
+
+    detections: Boxes
+    rows: IntArray
+    score: FloatArray
+    truth: Boxes
+    counted: BoolArray
+    iou: FloatArray
+
+
+def prepare(frame: DetectionFrame, evaluation_range: EvaluationRange | None = None, min_points: int = 0) -> Scene:
+    """Sort the detections, leave out those outside the range, and say which objects count.
+
+    Args:
+        frame: the frame.
+        evaluation_range: None for everywhere.
+        min_points: objects with fewer points in them are ignored.
+
+    Raises:
+        ValueError: `min_points` is not 0 and the frame has no point counts, or the range is empty.
+    """
+    counted = inside(frame.truth, evaluation_range)
+    if min_points > 0:
+        if frame.point_count is None:
+            raise ValueError(f"{frame.name}: min_points={min_points} needs frames with a point_count, got None")
+        counted = counted & (np.asarray(frame.point_count) >= min_points)
+    score = frame.detections.score if frame.detections.score is not None else np.zeros(0)
+    order = np.argsort(-score, kind="stable")
+    order = order[inside(frame.detections, evaluation_range)[order]]
+    detections = frame.detections[order]
+    return Scene(detections, order, score[order], frame.truth, counted, bev_iou(detections, frame.truth))
+
+
+def inside(boxes: Boxes, evaluation_range: EvaluationRange | None) -> BoolArray:
+    """(N,) whether a box's centre is in the range; the borders belong to it."""
+    if evaluation_range is None:
+        return np.ones(len(boxes), dtype=np.bool_)
+    x_min, x_max, y_min, y_max = evaluation_range
+    if not (x_min < x_max and y_min < y_max):
+        raise ValueError(f"evaluation_range must be x_min < x_max, y_min < y_max, got {evaluation_range}")
+    x, y = boxes.center[:, 0], boxes.center[:, 1]
+    within: BoolArray = (x_min <= x) & (x <= x_max) & (y_min <= y) & (y <= y_max)
+    return within
+
+
+def match(scene: Scene, threshold: float) -> IntArray:
+    """Row of the truth that each detection found, `FALSE` or `DROPPED`; the module's text says how.
+
+    Args:
+        scene: N detections, best first, and K objects.
+        threshold: least IoU of a true detection.
+
+    Returns:
+        (N,) rows in [0, K), none twice, or one of the two negative values.
+    """
+    free = scene.counted.copy()
+    on_ignored = (scene.iou[:, ~scene.counted] >= threshold).any(axis=1)
+    found = np.where(on_ignored, DROPPED, FALSE).astype(np.int64)
+    for row in np.flatnonzero((scene.iou[:, scene.counted] >= threshold).any(axis=1)):
+        overlap = np.where(free, scene.iou[row], -1.0)
+        best = int(overlap.argmax())
+        if overlap[best] >= threshold:
+            found[row] = best
+            free[best] = False
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An object that was missed, or a detection of nothing; lengths in metres, angles in radians.
+
+    Attributes:
+        kind: "missed" or "false".
+        frame: name of the frame.
+        agent: whose frame it is.
+        row: of the box in the frame's truth (missed) or detections (false).
+        label: of a missed object, where it has one.
+        x, y, z, length, width, height, yaw: the box, in the agent's LiDAR frame.
+        distance: of its centre from the agent, seen from above [m].
+        points: in the box, None where they were not counted.
+        score: of a false detection; for a missed object, of the detection (of any score) that overlaps it most.
+        best_iou: with that detection; for a false detection, with any object of the truth. One with a large overlap is
+            a second detection of one object.
+    """
+
+    kind: str
+    frame: str
+    agent: str
+    row: int
+    label: str
+    x: float
+    y: float
+    z: float
+    length: float
+    width: float
+    height: float
+    yaw: float
+    distance: float
+    points: int | None
+    score: float | None
+    best_iou: float
+
+
+def find_failures(
+    frame: DetectionFrame,
+    threshold: float = 0.5,
+    score_threshold: float = 0.3,
+    evaluation_range: EvaluationRange | None = None,
+    min_points: int = 0,
+) -> Iterator[Failure]:
+    """Every counted object that no detection of at least this score found, then every such detection that is false.
+
+    Args:
+        frame: the frame.
+        threshold: least IoU of a true detection.
+        score_threshold: least score of a detection that is taken seriously.
+        evaluation_range: as in `prepare`.
+        min_points: as in `prepare`.
+    """
+    scene = prepare(frame, evaluation_range, min_points)
+    found = np.where(scene.score >= score_threshold, match(scene, threshold), DROPPED)
+    for row in np.flatnonzero(scene.counted & ~np.isin(np.arange(len(scene.truth)), found)):
+        near = int(scene.iou[:, row].argmax()) if len(scene.detections) and scene.iou[:, row].any() else None
+        score = None if near is None else float(scene.score[near])
+        best = 0.0 if near is None else float(scene.iou[near, row])
+        yield _failure("missed", frame, scene.truth, int(row), int(row), frame.point_count, score, best)
+    for row in np.flatnonzero(found == FALSE):
+        best = float(scene.iou[row].max(initial=0.0))
+        original, counts, score = int(scene.rows[row]), frame.detection_point_count, float(scene.score[row])
+        yield _failure("false", frame, scene.detections, int(row), original, counts, score, best)
+
+
+def _failure(
+    kind: str,
+    frame: DetectionFrame,
+    boxes: Boxes,
+    row: int,
+    original: int,
+    counts: IntArray | None,
+    score: float | None,
+    best_iou: float,
+) -> Failure:
+    """`row` is that of the box in `boxes`, `original` the one in the frame and in `counts`."""
+    x, y, z = boxes.center[row].tolist()
+    length, width, height = boxes.size[row].tolist()
+    return Failure(
+        kind=kind,
+        frame=frame.name,
+        agent=frame.agent,
+        row=original,
+        label="" if boxes.label is None or kind == "false" else str(boxes.label[row]),
+        x=x,
+        y=y,
+        z=z,
+        length=length,
+        width=width,
+        height=height,
+        yaw=float(boxes.yaw[row]),
+        distance=float(np.hypot(x, y)),
+        points=None if counts is None else int(counts[original]),
+        score=score,
+        best_iou=best_iou,
+    )
