@@ -1,0 +1,275 @@
+"""The road networks that come with the package, and their geometry: where lanes, junctions and roadsides are.
+
+    network = RoadNetwork.load("junction_train_0")
+    network.distance_to_road(points)      # 0 on the road, otherwise how far beside it
+    network.roadside(spacing=6.0)         # points along the right edge of every road, for kerbs, poles, parked cars
+
+The world frame is right-handed, in metres, x east, y north, its origin in the middle of the network. The files are
+SUMO networks, made by `tools/build_networks.py`; reading them needs neither SUMO nor libsumo.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from xml.etree import ElementTree
+
+import numpy as np
+
+from cobevglue.datasets.frame import did_you_mean
+from cobevglue.typing import ArrayLike, BoolArray, FloatArray, StrArray
+
+__all__ = [
+    "NETWORKS",
+    "NETWORKS_FOLDER",
+    "NETWORK_KINDS",
+    "Junction",
+    "Lane",
+    "RoadNetwork",
+    "Roadside",
+    "network_file",
+]
+
+NETWORK_KINDS = ("junction", "t_junction", "roundabout", "highway", "residential")
+"""What kinds of network there are: signalised junction, T-junction, roundabout, highway with ramps, housing area."""
+
+_VARIANTS = {"train": 5, "validation": 1, "test": 2}
+
+NETWORKS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
+    {
+        split: tuple(f"{kind}_{split}_{index}" for kind in NETWORK_KINDS for index in range(count))
+        for split, count in _VARIANTS.items()
+    }
+)
+"""The names of the stored networks by split. No network is in two splits."""
+
+NETWORKS_FOLDER = Path(__file__).parent / "networks"
+
+_DEFAULT_LANE_WIDTH = 3.2  # SUMO's, where the file has none [m]
+_CHUNK = 4096  # points compared with all segments at once
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lane:
+    """One lane, in its driving direction.
+
+    Attributes:
+        id: SUMO's name of it.
+        edge: the directed road that it belongs to.
+        index: 0 is the rightmost lane of its edge.
+        centerline: (N, 2) points [m].
+        width: [m].
+        speed_limit: [m/s].
+        internal: whether it only leads over a junction.
+    """
+
+    id: str
+    edge: str
+    index: int
+    centerline: FloatArray
+    width: float
+    speed_limit: float
+    internal: bool
+
+    @property
+    def length(self) -> float:
+        """Length of the centre line [m]."""
+        return float(np.hypot(*np.diff(self.centerline, axis=0).T).sum())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Junction:
+    """Where roads meet.
+
+    Attributes:
+        id: SUMO's name of it.
+        kind: SUMO's type: "traffic_light", "priority", "right_before_left", …
+        polygon: (N, 2) its outline [m].
+    """
+
+    id: str
+    kind: str
+    polygon: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Roadside:
+    """K points along the right edges of roads.
+
+    Attributes:
+        xy: (K, 2) points [m].
+        yaw: (K,) the driving direction there [rad]; the road is on its left.
+        edge: (K,) the directed road.
+    """
+
+    xy: FloatArray
+    yaw: FloatArray
+    edge: StrArray
+
+
+@dataclass(frozen=True, eq=False)
+class RoadNetwork:
+    """A network's geometry in the world frame.
+
+    Attributes:
+        name: as in `NETWORKS`.
+        lanes: all lanes, those over junctions too.
+        junctions: all junctions that have an area.
+        routes: the edges of the way from every road that enters the network to every one that leaves it.
+    """
+
+    name: str
+    lanes: tuple[Lane, ...]
+    junctions: tuple[Junction, ...]
+    routes: tuple[tuple[str, ...], ...]
+
+    @classmethod
+    def load(cls, name: str) -> RoadNetwork:
+        """A stored network by its name.
+
+        Raises:
+            ValueError: there is none of this name; the message has the nearest one.
+        """
+        with gzip.open(network_file(name)) as file:
+            root = ElementTree.parse(file).getroot()
+        lanes = tuple(_lane(edge, lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
+        junctions = tuple(
+            Junction(node.attrib["id"], node.attrib["type"], polygon)
+            for node in root.iter("junction")
+            if len(polygon := _points(node.get("shape", ""))) >= 3
+            and node.attrib["type"] not in ("internal", "dead_end")
+        )
+        return cls(name, lanes, junctions, tuple(_routes(root)))
+
+    @property
+    def kind(self) -> str:
+        """One of `NETWORK_KINDS`."""
+        return next(kind for kind in NETWORK_KINDS if self.name.startswith(f"{kind}_"))
+
+    @cached_property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max of all lanes' centre lines [m]."""
+        points = np.concatenate([lane.centerline for lane in self.lanes])
+        (x_min, y_min), (x_max, y_max) = points.min(axis=0), points.max(axis=0)
+        return float(x_min), float(y_min), float(x_max), float(y_max)
+
+    def distance_to_road(self, points: ArrayLike) -> FloatArray:
+        """(M,) how far points (M, 2) are from the nearest road surface [m]; 0 on it."""
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        distance = np.empty(len(points))
+        start, step, half_width = self._segments
+        squared_length = np.maximum((step**2).sum(axis=1), 1e-12)
+        for first in range(0, len(points), _CHUNK):
+            here = points[first : first + _CHUNK]
+            x, y = (here[:, None, axis] - start[None, :, axis] for axis in (0, 1))
+            share = np.clip((x * step[:, 0] + y * step[:, 1]) / squared_length, 0.0, 1.0)
+            x -= share * step[:, 0]
+            y -= share * step[:, 1]
+            distance[first : first + _CHUNK] = (np.hypot(x, y) - half_width).min(axis=1)
+        for junction in self.junctions:
+            distance[_inside(points, junction.polygon)] = 0.0
+        return np.maximum(distance, 0.0)
+
+    def roadside(self, spacing: float, offset: float = 0.0) -> Roadside:
+        """Points along the right edge of every road but not of junctions.
+
+        Args:
+            spacing: between neighbours along a road [m].
+            offset: how far to the right of the road's edge [m]; negative is on the road.
+        """
+        if not spacing > 0:
+            raise ValueError(f"spacing must be > 0, got {spacing}")
+        xy, yaw, edge = [np.zeros((0, 2))], [np.zeros(0)], []
+        for lane in self.lanes:
+            if lane.internal or lane.index != 0:
+                continue
+            at, heading = _sample(lane.centerline, spacing)
+            right = np.column_stack([np.sin(heading), -np.cos(heading)])
+            xy.append(at + (lane.width / 2 + offset) * right)
+            yaw.append(heading)
+            edge += [lane.edge] * len(at)
+        return Roadside(np.concatenate(xy), np.concatenate(yaw), np.array(edge, dtype=np.str_))
+
+    @cached_property
+    def _segments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(S, 2) starts, (S, 2) steps and (S,) half widths of lane pieces and, without width, of junction outlines."""
+        lines = [(lane.centerline, lane.width / 2) for lane in self.lanes]
+        lines += [(np.vstack([junction.polygon, junction.polygon[:1]]), 0.0) for junction in self.junctions]
+        start = np.concatenate([line[:-1] for line, _ in lines])
+        step = np.concatenate([np.diff(line, axis=0) for line, _ in lines])
+        return start, step, np.concatenate([np.full(len(line) - 1, half) for line, half in lines])
+
+
+def network_file(name: str) -> Path:
+    """Where a stored network is.
+
+    Raises:
+        ValueError: there is none of this name; the message has the nearest one.
+    """
+    names = [known for split in NETWORKS.values() for known in split]
+    if name not in names:
+        raise ValueError(f"no road network {did_you_mean(name, names)}")
+    return NETWORKS_FOLDER / f"{name}.net.xml.gz"
+
+
+def _lane(edge: ElementTree.Element, lane: ElementTree.Element) -> Lane:
+    return Lane(
+        id=lane.attrib["id"],
+        edge=edge.attrib["id"],
+        index=int(lane.attrib["index"]),
+        centerline=_points(lane.attrib["shape"]),
+        width=float(lane.get("width", _DEFAULT_LANE_WIDTH)),
+        speed_limit=float(lane.attrib["speed"]),
+        internal=edge.get("function") == "internal",
+    )
+
+
+def _routes(root: ElementTree.Element) -> Iterator[tuple[str, ...]]:
+    """The ways with the fewest edges through a network, from every edge that nothing leads to."""
+    following: dict[str, list[str]] = {
+        edge.attrib["id"]: [] for edge in root.iter("edge") if edge.get("function") != "internal"
+    }
+    for link in root.iter("connection"):
+        start, end = link.attrib["from"], link.attrib["to"]
+        if start in following and end not in following[start]:
+            following[start].append(end)
+    for source in sorted(set(following).difference(*following.values())):
+        reached = {source: (source,)}
+        queue = deque([source])
+        while queue:
+            here = queue.popleft()
+            for edge in following[here]:
+                if edge not in reached:
+                    reached[edge] = (*reached[here], edge)
+                    queue.append(edge)
+            if not following[here]:
+                yield reached[here]
+
+
+def _points(shape: str) -> FloatArray:
+    return np.array([point.split(",")[:2] for point in shape.split()], dtype=np.float64).reshape(-1, 2)
+
+
+def _sample(line: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
+    """(K, 2) points every so many metres along a line, half a spacing from its start, and its (K,) headings there."""
+    step = np.diff(line, axis=0)
+    length = np.r_[0.0, np.cumsum(np.hypot(*step.T))]
+    at = np.arange(spacing / 2, length[-1], spacing)
+    xy = np.column_stack([np.interp(at, length, line[:, axis]) for axis in (0, 1)])
+    piece = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(step) - 1)
+    return xy, np.arctan2(step[piece, 1], step[piece, 0])
+
+
+def _inside(points: FloatArray, polygon: FloatArray) -> BoolArray:
+    """(M,) whether points are in a polygon: a ray to the right crosses its outline an odd number of times."""
+    inside = np.zeros(len(points), dtype=np.bool_)
+    x, y = points.T
+    for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if ay != by:
+            inside ^= ((ay > y) != (by > y)) & (x < (bx - ax) * (y - ay) / (by - ay) + ax)
+    return inside

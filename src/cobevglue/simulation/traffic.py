@@ -1,0 +1,360 @@
+"""Traffic on a stored road network, driven by SUMO: who is where, step by step.
+
+    with Traffic("junction_train_0", seed=1) as traffic:
+        for _ in range(100):
+            traffic.step(0.1)
+            now = traffic.vehicles()
+            now.x, now.y, now.yaw, now.length      # boxes on the ground, world frame
+
+SUMO follows, queues, yields, changes lanes. Needs libsumo (`pip install cobevglue[simulation]`), which holds one
+simulation a process; hence one open `Traffic` at a time.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections import Counter
+from dataclasses import dataclass
+from types import MappingProxyType, TracebackType
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from cobevglue.boxes import Boxes
+from cobevglue.se2 import wrap_angle
+from cobevglue.settings import Settings
+from cobevglue.simulation.road_network import RoadNetwork, network_file
+from cobevglue.typing import FloatArray, IntArray, StrArray
+
+__all__ = ["VEHICLE_KINDS", "Traffic", "TrafficSettings", "TrafficSnapshot"]
+
+_TRAFFIC_STREAM = 0
+_STEP = 0.1  # how finely SUMO moves vehicles [s]
+_STEPS_PER_DEMAND = 5  # steps after which vehicles are added in place of those that left
+_SPACE_PER_VEHICLE = 13.0  # of lane; denser than this nothing moves [m]
+_EDGE_MARGIN = 0.15  # vehicles beside the middle of their lane keep at least this far from its edge [m]
+_LATERAL_RESOLUTION = 0.8  # SUMO lets vehicles be anywhere in a lane, and cross lines slowly, if it has one [m]
+_PATIENCE = 2.0  # a vehicle that finds no room where it should appear is given up after this time [s]
+
+
+class _Kind(NamedTuple):
+    """What vehicles of a kind are like: ranges of the dimensions [m], SUMO's class and how they drive."""
+
+    share: float
+    length: tuple[float, float]
+    width: tuple[float, float]
+    height: tuple[float, float]
+    sumo_class: str
+    acceleration: float  # [m/s^2]
+    top_speed: float  # [m/s]
+
+
+_KINDS = MappingProxyType(
+    {
+        "hatchback": _Kind(0.24, (3.5, 4.4), (1.75, 2.05), (1.4, 1.6), "passenger", 2.6, 50.0),
+        "sedan": _Kind(0.22, (4.4, 5.2), (1.8, 2.15), (1.38, 1.52), "passenger", 2.6, 50.0),
+        "suv": _Kind(0.20, (4.2, 5.1), (1.85, 2.2), (1.58, 1.9), "passenger", 2.6, 50.0),
+        "coupe": _Kind(0.05, (4.1, 4.8), (1.8, 2.1), (1.3, 1.42), "passenger", 3.5, 55.0),
+        "jeep": _Kind(0.04, (3.8, 4.8), (1.8, 2.1), (1.7, 1.95), "passenger", 2.4, 40.0),
+        "pickup": _Kind(0.05, (5.0, 5.4), (1.9, 2.25), (1.75, 1.95), "passenger", 2.4, 45.0),
+        "van": _Kind(0.08, (5.0, 6.5), (2.0, 2.3), (2.0, 2.8), "delivery", 2.0, 40.0),
+        "truck": _Kind(0.06, (7.0, 12.0), (2.4, 2.7), (2.8, 3.9), "truck", 1.3, 25.0),
+        "bus": _Kind(0.03, (10.0, 13.0), (2.5, 2.6), (3.0, 3.4), "bus", 1.2, 25.0),
+        "motorcycle": _Kind(0.03, (1.9, 2.4), (0.7, 0.95), (1.4, 1.8), "motorcycle", 4.0, 50.0),
+    }
+)
+
+VEHICLE_KINDS = tuple(_KINDS)
+"""What kinds of vehicle there are."""
+
+_IN_HOUSING = MappingProxyType({"truck": 0.3, "bus": 0.3})  # how much rarer these are in a housing area
+
+# How fast traffic flows, as a share of the speed limits, and how many vehicles there are per 100 m of lane.
+_FLOW = MappingProxyType(
+    {
+        "junction": ((0.8, 1.1), (0.8, 4.0)),
+        "t_junction": ((0.8, 1.1), (1.2, 4.5)),
+        "roundabout": ((0.8, 1.1), (1.2, 4.5)),
+        "highway": ((0.25, 1.0), (0.8, 4.0)),
+        "residential": ((0.7, 1.1), (0.8, 2.5)),
+    }
+)
+
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class TrafficSettings(Settings):
+    """How much traffic there is.
+
+    Attributes:
+        vehicles: how many vehicles SUMO tries to keep on the network; None draws it, from light traffic to queues.
+        speed_factor: speed limits are multiplied by this; None draws it. A slow highway is a full one.
+        warm_up: how long traffic runs before the scene begins [s].
+        lateral_offset: how far vehicles drive beside the middle of their lane at most, if the lane is wide enough [m].
+
+    Raises:
+        ValueError: a value out of its range, or an unknown field.
+    """
+
+    vehicles: Annotated[int, Field(ge=1, le=1000)] | None = None
+    speed_factor: _Positive | None = None
+    warm_up: _NotNegative = 20.0
+    lateral_offset: _NotNegative = 0.3
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrafficSnapshot:
+    """N vehicles at one time, in the world frame (x east, y north), by id.
+
+    Attributes:
+        time: since the scene began [s].
+        id: (N,) who it is: the same number as long as the vehicle is on the network, never given twice.
+        kind: (N,) one of `VEHICLE_KINDS`.
+        length: (N,) [m].
+        width: (N,) with mirrors [m].
+        height: (N,) above the ground [m].
+        x: (N,) the box's centre [m].
+        y: (N,) the box's centre [m].
+        yaw: (N,) heading from x towards y [rad].
+        speed: (N,) [m/s].
+    """
+
+    time: float
+    id: IntArray
+    kind: StrArray
+    length: FloatArray
+    width: FloatArray
+    height: FloatArray
+    x: FloatArray
+    y: FloatArray
+    yaw: FloatArray
+    speed: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def boxes(self) -> Boxes:
+        """The vehicles as boxes standing on z = 0, with track ids and labels."""
+        return Boxes(
+            center=np.column_stack([self.x, self.y, self.height / 2]),
+            size=np.column_stack([self.length, self.width, self.height]),
+            yaw=self.yaw,
+            track_id=self.id,
+            label=self.kind,
+        )
+
+
+class _Vehicle(NamedTuple):
+    """What SUMO need not be asked for: the kind, and length, width, height [m]."""
+
+    kind: str
+    size: tuple[float, float, float]
+
+
+class Traffic:
+    """A running traffic simulation. Same network, seed, settings and steps: same bytes.
+
+    Attributes:
+        network: the name of the stored network.
+        seed: a whole number >= 0.
+        settings: how much traffic there is.
+        roads: the network's geometry.
+        target: how many vehicles are kept on the network; fewer where roads do not take so many.
+
+    Raises:
+        ValueError: there is no such network; the message has the nearest one.
+        ModuleNotFoundError: libsumo is not installed.
+        RuntimeError: another `Traffic` is open in this process.
+    """
+
+    def __init__(self, network: str, seed: int = 0, settings: TrafficSettings | None = None) -> None:
+        self.network = network
+        self.seed = seed
+        self.settings = settings = settings or TrafficSettings()
+        self.roads = RoadNetwork.load(network)
+        self._rng = rng = np.random.default_rng([seed, _TRAFFIC_STREAM, 0])
+        speed_range, density_range = _FLOW[self.roads.kind]
+        drawn_speed, drawn_density = rng.uniform(*speed_range), rng.uniform(*density_range)
+        lanes = [lane for lane in self.roads.lanes if not lane.internal]
+        road = sum(lane.length for lane in lanes)
+        wanted = round(road * drawn_density / 100.0) if settings.vehicles is None else settings.vehicles
+        self.target = max(1, min(wanted, int(road / _SPACE_PER_VEHICLE)))
+        self._narrowest = min(lane.width for lane in lanes)
+        self._known: dict[str, _Vehicle] = {}
+        self._routes: dict[tuple[str, ...], str] = {}
+        self._steps = self._recorded_from = 0
+        self._sumo = _open_libsumo(self)
+        try:
+            self._start(drawn_speed if settings.speed_factor is None else settings.speed_factor)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Traffic:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the simulation, so that another can be opened."""
+        global _open
+        if _open is not None and _open() is self:
+            _open = None
+            self._sumo.close()
+
+    @property
+    def time(self) -> float:
+        """Time since the scene began [s]."""
+        return (self._steps - self._recorded_from) * _STEP
+
+    def step(self, seconds: float = _STEP) -> None:
+        """Go on by this time: a multiple of 0.1 s.
+
+        Raises:
+            ValueError: not a positive multiple of 0.1 s.
+            RuntimeError: the simulation is closed.
+        """
+        self._refuse_closed()
+        steps = round(seconds / _STEP) if math.isfinite(seconds) else 0
+        if steps < 1 or abs(steps * _STEP - seconds) > 1e-6:
+            raise ValueError(f"seconds must be a positive multiple of {_STEP}, got {seconds}")
+        for _ in range(steps):
+            if self._steps % _STEPS_PER_DEMAND == 0:
+                self._replace_those_gone()
+            self._sumo.simulationStep()
+            self._steps += 1
+
+    def vehicles(self) -> TrafficSnapshot:
+        """All vehicles now.
+
+        Raises:
+            RuntimeError: the simulation is closed.
+        """
+        self._refuse_closed()
+        vehicle = self._sumo.vehicle
+        names = sorted(vehicle.getIDList(), key=int)
+        known = [self._known[name] for name in names]
+        front = np.array([vehicle.getPosition(name) for name in names], dtype=np.float64).reshape(-1, 2)
+        # SUMO's angles are clockwise from north.
+        yaw = wrap_angle(math.pi / 2 - np.radians([vehicle.getAngle(name) for name in names]))
+        size = np.array([one.size for one in known], dtype=np.float64).reshape(-1, 3)
+        # SUMO's positions are those of front bumpers.
+        centre = front - size[:, :1] / 2 * np.column_stack([np.cos(yaw), np.sin(yaw)])
+        return TrafficSnapshot(
+            time=self.time,
+            id=np.array(names, dtype=np.int64),
+            kind=np.array([one.kind for one in known], dtype=np.str_),
+            length=size[:, 0],
+            width=size[:, 1],
+            height=size[:, 2],
+            x=centre[:, 0],
+            y=centre[:, 1],
+            yaw=yaw,
+            speed=np.array([vehicle.getSpeed(name) for name in names], dtype=np.float64),
+        )
+
+    def _start(self, speed_factor: float) -> None:
+        """Start SUMO, put vehicles all along the roads, and let them sort themselves out."""
+        sumo, rng = self._sumo, self._rng
+        options = ["--net-file", str(network_file(self.network)), "--seed", str(self.seed % 2**31)]
+        options += ["--step-length", str(_STEP), "--lateral-resolution", str(_LATERAL_RESOLUTION)]
+        options += ["--time-to-teleport", "-1", "--collision.action", "none", "--max-depart-delay", str(_PATIENCE)]
+        options += ["--no-step-log", "--no-warnings", "--duration-log.disable"]
+        sumo.start(["sumo", *options])
+        for lane in self.roads.lanes:
+            sumo.lane.setMaxSpeed(lane.id, lane.speed_limit * speed_factor)
+        for name in sumo.trafficlight.getIDList():
+            phases = len(sumo.trafficlight.getAllProgramLogics(name)[0].phases)
+            sumo.trafficlight.setPhase(name, int(rng.integers(phases)))
+        for kind, facts in _KINDS.items():
+            sumo.vehicletype.copy("DEFAULT_VEHTYPE", kind)
+            sumo.vehicletype.setVehicleClass(kind, facts.sumo_class)
+            sumo.vehicletype.setAccel(kind, facts.acceleration)
+            sumo.vehicletype.setMaxSpeed(kind, facts.top_speed)
+        rare = np.array([1.0 if self.roads.kind != "residential" else _IN_HOUSING.get(kind, 1.0) for kind in _KINDS])
+        shares = rare * [facts.share for facts in _KINDS.values()]
+        self._kind_shares = shares / shares.sum()
+        self._route_shares = self._draw_route_shares()
+        self._lane_length = Counter[str]()
+        for lane in self.roads.lanes:
+            self._lane_length[lane.edge] += lane.length
+        for _ in range(self.target):
+            self._add_vehicle(anywhere=True)
+        steps = round(self.settings.warm_up / _STEP)
+        if steps:
+            self.step(steps * _STEP)
+        self._recorded_from = self._steps
+
+    def _draw_route_shares(self) -> FloatArray:
+        """How often each of the network's routes is driven: some roads are busier than others."""
+        roads = Counter(lane.edge for lane in self.roads.lanes)
+        ends = sorted({edge for route in self.roads.routes for edge in (route[0], route[-1])})
+        busy = {edge: self._rng.uniform(0.3, 1.0) * roads[edge] for edge in ends}
+        weight = np.array([busy[route[0]] * busy[route[-1]] for route in self.roads.routes])
+        return weight / weight.sum()
+
+    def _replace_those_gone(self) -> None:
+        """Add vehicles at the fringe until there are as many as there should be, those still waiting included."""
+        vehicles = self._sumo.vehicle.getIDCount() + len(self._sumo.simulation.getPendingVehicles())
+        for _ in range(self.target - vehicles):
+            self._add_vehicle(anywhere=False)
+
+    def _add_vehicle(self, anywhere: bool) -> None:
+        """Ask SUMO for one more vehicle, at the beginning of a trip or anywhere on one."""
+        sumo, rng = self._sumo, self._rng
+        edges = self.roads.routes[int(rng.choice(len(self.roads.routes), p=self._route_shares))]
+        if anywhere:
+            room = np.array([self._lane_length[edge] for edge in edges])
+            edges = edges[int(rng.choice(len(edges), p=room / room.sum())) :]
+        if edges not in self._routes:
+            self._routes[edges] = f"route{len(self._routes)}"
+            sumo.route.add(self._routes[edges], edges)
+        kind = VEHICLE_KINDS[int(rng.choice(len(VEHICLE_KINDS), p=self._kind_shares))]
+        facts = _KINDS[kind]
+        # One draw for how big it is as a whole, and a little of each dimension's own: long vehicles tend to be wide.
+        shares = np.clip(rng.uniform() + rng.uniform(-0.25, 0.25, 3), 0.0, 1.0)
+        size = [low + share * (high - low) for share, (low, high) in zip(shares, facts[1:4], strict=True)]
+        beside = min(self.settings.lateral_offset, max(0.0, (self._narrowest - size[1]) / 2 - _EDGE_MARGIN))
+        name = str(len(self._known))
+        self._known[name] = _Vehicle(kind, (float(size[0]), float(size[1]), float(size[2])))
+        sumo.vehicle.add(
+            name,
+            self._routes[edges],
+            typeID=kind,
+            departLane="best_prob" if anywhere else "free",
+            departPos="random_free" if anywhere else "base",
+            departSpeed="max",
+        )
+        sumo.vehicle.setLength(name, size[0])
+        sumo.vehicle.setWidth(name, size[1])
+        sumo.vehicle.setHeight(name, size[2])
+        sumo.vehicle.setMinGap(name, rng.uniform(1.2, 3.0))
+        sumo.vehicle.setLateralAlignment(name, f"{rng.uniform(-beside, beside):.2f}")
+
+    def _refuse_closed(self) -> None:
+        if _open is None or _open() is not self:
+            raise RuntimeError("this Traffic is closed")
+
+
+_open: weakref.ref[Traffic] | None = None
+
+
+def _open_libsumo(owner: Traffic) -> Any:
+    """The libsumo module, from now on `owner`'s."""
+    global _open
+    try:
+        import libsumo
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("traffic needs SUMO: pip install cobevglue[simulation]") from None
+    if libsumo.isLoaded():
+        if _open is None or _open() is not None:
+            raise RuntimeError("SUMO runs one simulation a process: close() the other Traffic first")
+        libsumo.close()  # its owner was forgotten without having been closed
+    _open = weakref.ref(owner)
+    return libsumo

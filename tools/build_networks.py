@@ -1,0 +1,330 @@
+"""Rebuild the road networks stored in `cobevglue.simulation`: five kinds, each in several seeded variants.
+
+    pip install eclipse-sumo && python tools/build_networks.py
+
+Needed only to change the networks: the stored files run with libsumo alone. Each variant is written as plain nodes,
+edges and connections, and SUMO's netconvert makes lanes, junction areas, right of way and signal plans of them. The
+files are the same bytes every time for one version of netconvert.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from cobevglue.simulation.road_network import NETWORK_KINDS, NETWORKS, NETWORKS_FOLDER
+from cobevglue.typing import FloatArray
+
+_EXTENT = 190.0  # how far roads reach from the centre [m]
+_TOWN, _RESIDENTIAL, _HIGHWAY, _RAMP = 13.9, 8.3, 30.6, 19.4  # speed limits [m/s]
+_POINT_SPACING = 8.0  # between the points of curved roads [m]
+
+
+@dataclass
+class Plan:
+    """Plain SUMO input; `edge` and the others add one XML element each."""
+
+    nodes: list[str] = field(default_factory=list)
+    edges: list[str] = field(default_factory=list)
+    connections: list[str] = field(default_factory=list)
+
+    def node(self, name: str, xy: FloatArray, **attributes: object) -> None:
+        """A place where roads begin, meet or end."""
+        self.nodes.append(_element("node", id=name, x=f"{xy[0]:.2f}", y=f"{xy[1]:.2f}", **attributes))
+
+    def edge(
+        self,
+        name: str,
+        start: str,
+        end: str,
+        shape: FloatArray,
+        lanes: int,
+        speed: float,
+        width: float,
+        pocket: float = 0.0,
+        **attributes: object,
+    ) -> None:
+        """A directed road; with a `pocket` its leftmost lane exists on the last so many metres only."""
+        points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
+        split = ""
+        if pocket:
+            through = " ".join(str(lane) for lane in range(lanes - 1))
+            all_lanes = " ".join(str(lane) for lane in range(lanes))
+            split = _element("split", pos=0, lanes=through) + _element("split", pos=-pocket, lanes=all_lanes)
+        text = _element(
+            "edge",
+            **{"id": name, "from": start, "to": end, "shape": points, "numLanes": lanes},
+            speed=f"{speed:.2f}",
+            width=f"{width:.2f}",
+            **attributes,
+        )
+        self.edges.append(text if not split else text[:-2] + ">" + split + "</edge>")
+
+    def connect(self, start: str, end: str, *lanes: tuple[int, int]) -> None:
+        """Which lane of one edge leads to which of the next."""
+        for a, b in lanes:
+            self.connections.append(_element("connection", **{"from": start, "to": end, "fromLane": a, "toLane": b}))
+
+
+def junction(rng: np.random.Generator, variant: int) -> Plan:
+    """Four arms, signals, lanes for turning left on some of them."""
+    plan = Plan()
+    plan.node("c", np.zeros(2), type="traffic_light")
+    angles = np.arange(4) * math.pi / 2 + rng.uniform(-0.4, 0.4, 4) + rng.uniform(0, math.pi / 2)
+    main, width = 2 + variant % 2, rng.uniform(3.1, 3.75)
+    side = int(rng.integers(1, main + 1))
+    for arm, angle in enumerate(angles):
+        pocket = float(rng.uniform(40, 70)) if rng.random() < 0.6 or arm % 2 == 0 else 0.0
+        _arm(plan, f"{arm}", angle, rng, main if arm % 2 == 0 else side, width, pocket)
+    return plan
+
+
+def t_junction(rng: np.random.Generator, variant: int) -> Plan:
+    """A through road and a side road, with right of way or signals."""
+    plan = Plan()
+    plan.node("c", np.zeros(2), type="traffic_light" if variant % 2 else "priority")
+    turned, width = rng.uniform(0, 2 * math.pi), rng.uniform(3.0, 3.6)
+    bend, side = rng.uniform(-0.35, 0.35), math.pi / 2 + rng.uniform(-0.45, 0.45)
+    main = 1 + variant // 2 % 2
+    for arm, angle in enumerate((0.0, math.pi + bend, side)):
+        lanes = main if arm < 2 else 1
+        pocket = float(rng.uniform(30, 50)) if arm == 0 or (arm == 2 and rng.random() < 0.5) else 0.0
+        _arm(plan, f"{arm}", turned + angle, rng, lanes, width, pocket, priority=9 if arm < 2 else 3)
+    return plan
+
+
+def roundabout(rng: np.random.Generator, variant: int) -> Plan:
+    """A ring with three to five arms."""
+    plan = Plan()
+    arms, ring_lanes = 3 + variant % 3, 1 + (variant // 2) % 2
+    radius = float(rng.uniform(15, 20) + 4 * (arms - 3) + 4 * (ring_lanes - 1))
+    width = rng.uniform(3.2, 3.75)
+    spread = 2 * math.pi / arms
+    angles = np.arange(arms) * spread + rng.uniform(-0.14, 0.14, arms) * spread + rng.uniform(0, 2 * math.pi)
+    half = 8.0 / radius  # from an arm's middle line to where its entry and exit meet the ring [rad]
+    on_ring = [
+        (f"{kind}{arm}", angles[arm] + sign * half) for arm in range(arms) for kind, sign in (("x", -1), ("e", 1))
+    ]
+    for name, angle in on_ring:
+        plan.node(name, radius * _unit(angle))
+    for (start, a), (end, b) in zip(on_ring, on_ring[1:] + on_ring[:1], strict=True):
+        b = a + (b - a) % (2 * math.pi)
+        steps = np.linspace(a, b, max(3, round((b - a) * radius / 4)))
+        plan.edge(f"ring_{start}", start, end, radius * _units(steps), ring_lanes, 8.3, width + 0.4, priority=9)
+    for arm, angle in enumerate(angles):
+        line = _line(radius + 14.0, _EXTENT, angle, rng.uniform(-0.003, 0.003))
+        lanes = ring_lanes
+        plan.node(f"n{arm}", line[-1])
+        entry, exit_ = (radius * _unit(dict(on_ring)[f"{kind}{arm}"]) for kind in "ex")
+        # Both meet the ring half along it, half towards its centre.
+        flare_in = _bend(line[0], -_unit(angle), entry, _unit(angle + half + math.pi / 2) - 0.9 * _unit(angle + half))
+        flare_out = _bend(exit_, _unit(angle - half + math.pi / 2) + 0.9 * _unit(angle - half), line[0], _unit(angle))
+        common = {"lanes": lanes, "speed": _TOWN, "width": width, "priority": 3}
+        plan.edge(f"in{arm}", f"n{arm}", f"e{arm}", np.vstack([line[:0:-1], flare_in]), **common)  # type: ignore[arg-type]
+        plan.edge(f"out{arm}", f"x{arm}", f"n{arm}", np.vstack([flare_out, line[1:]]), **common)  # type: ignore[arg-type]
+    return plan
+
+
+def highway(rng: np.random.Generator, variant: int) -> Plan:
+    """Two carriageways, each with an exit and an entry."""
+    plan = Plan()
+    lanes, width = 3 + variant % 2, rng.uniform(3.5, 3.75)
+    turned, curvature, median = rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1) / 900, rng.uniform(1.5, 4.0)
+    reach = _EXTENT + 30.0
+    ahead = _line(0.0, reach, turned, curvature)
+    # Left of the middle line of the road, so that the two halves meet in the centre with one direction.
+    behind = _line(0.0, reach, turned + math.pi, -curvature)
+    middle = np.vstack([behind[:0:-1], ahead])
+    for side, line in (("a", middle), ("b", middle[::-1])):
+        line = _shifted(line, median)
+        cuts = np.array([0.0, 0.16, 0.40, 0.60, 0.84, 1.0]) + np.r_[0.0, rng.uniform(-0.03, 0.03, 4), 0.0]
+        parts = _cut(line, cuts)
+        for index, part in enumerate(parts):
+            plan.node(f"{side}{index}", part[0], type="priority")
+        plan.node(f"{side}5", line[-1])
+        for index, part in enumerate(parts):
+            # Spreading to the right keeps the left lane in place; the exit's and the entry's lane come on the right.
+            extra = index in (1, 3)
+            name = f"{side}{index}"
+            plan.edge(name, name, f"{side}{index + 1}", part, lanes + extra, _HIGHWAY, width, priority=12)
+            if index:
+                shift = int(extra) - int(index in (2, 4))
+                pairs = [
+                    (k, k + shift)
+                    for k in range(lanes + 1)
+                    if 0 <= k + shift < lanes + extra and k < lanes + (index in (2, 4))
+                ]
+                plan.connect(f"{side}{index - 1}", name, *pairs, *([(0, 0)] if extra else []))
+        outwards = rng.uniform(0.35, 0.6)
+        for kind, at, direction in (("exit", parts[2], 1), ("entry", parts[3], -1)):
+            along = _direction(at[:2]) * direction
+            left = np.array([-along[1], along[0]]) * direction
+            corner = at[0] - left * width * lanes  # where the lane beside the road's own lanes has its left edge
+            angle = math.atan2(along[1], along[0]) - direction * 0.12
+            ramp = corner + _line(0.0, 120.0, angle, -direction * outwards / 120.0)
+            plan.node(f"{side}{kind}", ramp[-1])
+            if direction == 1:
+                plan.edge(f"{side}{kind}", f"{side}2", f"{side}{kind}", ramp, 1, _RAMP, width, priority=7)
+                plan.connect(f"{side}1", f"{side}{kind}", (0, 0))
+            else:
+                plan.edge(f"{side}{kind}", f"{side}{kind}", f"{side}3", ramp[::-1], 1, _RAMP, width, priority=7)
+                plan.connect(f"{side}{kind}", f"{side}3", (0, 0))
+    return plan
+
+
+def residential(rng: np.random.Generator, variant: int) -> Plan:
+    """A narrow winding street with side streets."""
+    plan = Plan()
+    width, kind = rng.uniform(3.0, 3.3), "right_before_left" if variant % 2 else "priority"
+    turned, waves, phase = rng.uniform(0, 2 * math.pi), rng.uniform(0.3, 0.7), rng.uniform(0, 2 * math.pi)
+    along = np.linspace(-_EXTENT, _EXTENT, 49)
+    swing = 24.0 * (np.sin(2 * math.pi * waves * along / _EXTENT + phase) - np.sin(phase))
+    street = np.column_stack([along, swing]) @ np.array([_unit(turned), _unit(turned + math.pi / 2)])
+    sides = 3 + variant % 3
+    cuts = (np.arange(sides) + 0.5 + rng.uniform(-0.25, 0.25, sides)) / sides
+    parts = _cut(street, np.r_[0.0, cuts, 1.0])
+    for index, part in enumerate(parts):
+        inside = index > 0
+        plan.node(f"m{index}", part[0], **({"type": kind} if inside else {}))
+    plan.node(f"m{sides + 1}", street[-1])
+    for index, part in enumerate(parts):
+        start, end = f"m{index}", f"m{index + 1}"
+        plan.edge(f"main{index}", start, end, part, 1, _RESIDENTIAL, width, priority=5)
+        plan.edge(f"back{index}", end, start, part[::-1], 1, _RESIDENTIAL, width, priority=5)
+    first = int(rng.integers(2))
+    for index in range(1, sides + 1):
+        heading = math.atan2(*_direction(parts[index][:2])[::-1])
+        for sign in (1, -1) if rng.random() < 0.35 else ((1,) if (index + first) % 2 else (-1,)):
+            angle = heading + sign * (math.pi / 2 + rng.uniform(-0.3, 0.3))
+            side = parts[index][0] + _line(0.0, rng.uniform(90, 150), angle, rng.uniform(-0.005, 0.005))
+            name = f"{index}{'l' if sign > 0 else 'r'}"
+            plan.node(f"s{name}", side[-1])
+            plan.edge(f"from{name}", f"s{name}", f"m{index}", side[::-1], 1, _RESIDENTIAL, width, priority=3)
+            plan.edge(f"to{name}", f"m{index}", f"s{name}", side, 1, _RESIDENTIAL, width, priority=3)
+    return plan
+
+
+_BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
+    "junction": junction,
+    "t_junction": t_junction,
+    "roundabout": roundabout,
+    "highway": highway,
+    "residential": residential,
+}
+
+
+def _arm(
+    plan: Plan,
+    name: str,
+    angle: float,
+    rng: np.random.Generator,
+    lanes: int,
+    width: float,
+    pocket: float,
+    **attributes: object,
+) -> None:
+    """A road of `lanes` each way from the node "c" outwards, straight or curved."""
+    curvature = float(rng.choice([0.0, 1.0, -1.0])) * rng.uniform(1 / 500, 1 / 180)
+    line = _line(0.0, _EXTENT, angle, curvature, straight=55.0)
+    plan.node(f"n{name}", line[-1])
+    plan.edge(f"in{name}", f"n{name}", "c", line[::-1], lanes + bool(pocket), _TOWN, width, pocket, **attributes)
+    plan.edge(f"out{name}", "c", f"n{name}", line, lanes, _TOWN, width, **attributes)
+
+
+def _line(start: float, end: float, angle: float, curvature: float, straight: float = 0.0) -> FloatArray:
+    """(N, 2) points that leave the origin's surroundings at distance `start` in this direction, then bend."""
+    along = np.linspace(start, end, max(2, math.ceil((end - start) / _POINT_SPACING) + 1))
+    heading = angle + curvature * np.maximum(along - start - straight, 0.0)
+    steps = np.diff(along)[:, None] * _units((heading[:-1] + heading[1:]) / 2)
+    return np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)]) + start * _unit(angle)
+
+
+def _bend(start: FloatArray, leaving: FloatArray, end: FloatArray, arriving: FloatArray) -> FloatArray:
+    """(N, 2) a smooth curve between two points with these directions (a Bézier curve)."""
+    reach = 0.45 * np.hypot(*(end - start))
+    a = start + reach * leaving / np.hypot(*leaving)
+    b = end - reach * arriving / np.hypot(*arriving)
+    t = np.linspace(0.0, 1.0, 9)[:, None]
+    curve: FloatArray = (1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * a + 3 * t**2 * (1 - t) * b + t**3 * end
+    return curve
+
+
+def _cut(line: FloatArray, shares: FloatArray) -> list[FloatArray]:
+    """The pieces of a line between these shares of its length."""
+    length = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
+    pieces = []
+    for low, high in zip(shares[:-1] * length[-1], shares[1:] * length[-1], strict=True):
+        inside = line[(length > low + 1.0) & (length < high - 1.0)]
+        ends = [[np.interp(at, length, line[:, axis]) for axis in (0, 1)] for at in (low, high)]
+        pieces.append(np.vstack([ends[0], inside, ends[1]]))
+    return pieces
+
+
+def _shifted(line: FloatArray, right: float) -> FloatArray:
+    """A line moved to its right."""
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.hypot(*tangent.T)[:, None]
+    moved: FloatArray = line + right * np.column_stack([tangent[:, 1], -tangent[:, 0]])
+    return moved
+
+
+def _direction(two: FloatArray) -> FloatArray:
+    step: FloatArray = two[1] - two[0]
+    return step / float(np.hypot(*step))
+
+
+def _unit(angle: float) -> FloatArray:
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def _units(angle: FloatArray) -> FloatArray:
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _element(tag: str, **attributes: object) -> str:
+    return f"<{tag} " + " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items()) + "/>"
+
+
+def build(plan: Plan, file: Path) -> None:
+    """Run netconvert on a plan and store what it makes."""
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        for tag, elements in (("node", plan.nodes), ("edge", plan.edges), ("connection", plan.connections)):
+            (work / f"{tag}.xml").write_text(f"<{tag}s>\n" + "\n".join(elements) + f"\n</{tag}s>\n")
+        command = [str(Path(sys.executable).with_name("netconvert"))]
+        command += ["--node-files", "node.xml", "--edge-files", "edge.xml", "--connection-files", "connection.xml"]
+        command += ["--output-file", "net.xml", "--no-turnarounds", "--offset.disable-normalization"]
+        command += ["--junctions.corner-detail", "6", "--junctions.internal-link-detail", "8", "--precision", "2"]
+        command += ["--tls.green.time", "20", "--no-turnarounds.geometry", "--aggregate-warnings", "3"]
+        subprocess.run(command, cwd=work, check=True, stdout=subprocess.DEVNULL)
+        text = (work / "net.xml").read_text()
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)  # the date of building
+    file.write_bytes(gzip.compress(text.encode(), mtime=0))
+
+
+def main() -> None:
+    """Build all networks."""
+    NETWORKS_FOLDER.mkdir(exist_ok=True)
+    for split_index, (split, names) in enumerate(NETWORKS.items()):
+        for name in names:
+            kind, _, index = name.partition(f"_{split}_")
+            rng = np.random.default_rng([NETWORK_KINDS.index(kind), split_index, int(index)])
+            # Validation and test go on counting where training stops, so that they are not its first variants again.
+            variant = int(index) + 4 * split_index
+            file = NETWORKS_FOLDER / f"{name}.net.xml.gz"
+            build(_BUILDERS[kind](rng, variant), file)
+            print(f"{file.name}: {file.stat().st_size / 1000:.1f} kB")
+
+
+if __name__ == "__main__":
+    main()
