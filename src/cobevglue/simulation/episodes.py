@@ -1,0 +1,137 @@
+"""Simulated clouds for training and testing a detector: many short looks into many worlds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from cobevglue.boxes import Boxes
+from cobevglue.settings import Settings
+from cobevglue.simulation.lidar import LIDARS, LidarSettings
+from cobevglue.simulation.road_network import NETWORKS
+from cobevglue.simulation.traffic import Traffic
+from cobevglue.simulation.world import LidarView, World
+from cobevglue.typing import Float32Array, IntArray
+
+__all__ = ["EpisodeSettings", "LabelledCloud", "SimulatedEpisodes"]
+
+_EPISODE_STREAM = 30
+_AGENT_KINDS = ("sedan", "hatchback", "coupe", "suv")
+"""What may carry a sensor: it stands 1.9 m high, above the roof."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LabelledCloud:
+    """One cloud and the objects in it, in the sensor's frame.
+
+    Attributes:
+        points: (N, 4) float32 x, y, z [m] and intensity.
+        boxes: K objects that at least one point lies on.
+        point_count: (K,) how many points lie on each.
+    """
+
+    points: Float32Array
+    boxes: Boxes
+    point_count: IntArray
+
+
+class EpisodeSettings(Settings):
+    """What an episode is made of.
+
+    Attributes:
+        snapshots: how many instants of a world are looked at.
+        agents: how many vehicles look at each.
+        interval: time between instants [s].
+        lidars: the sensors by their names in `LIDARS` and how often each is used.
+        vary_sensor: change drop-outs, noise and height from episode to episode, so that no exact sensor is learnt.
+        keep_own_points: share of clouds that keep the points on the agent's own body.
+    """
+
+    snapshots: Annotated[int, Field(ge=1, le=1000)] = 3
+    agents: Annotated[int, Field(ge=1, le=100)] = 4
+    interval: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
+    lidars: dict[str, float] = {"opv2v": 1.0}
+    vary_sensor: bool = True
+    keep_own_points: Annotated[float, Field(ge=0.0, le=1.0)] = 0.4
+
+
+@dataclass(frozen=True)
+class SimulatedEpisodes:
+    """Episodes of one split. Same split, seed and settings: the same episodes, in any process.
+
+    Attributes:
+        split: "train", "validation" or "test"; their networks and their randomness are disjoint.
+        seed: a whole number >= 0.
+        settings: what an episode is made of.
+
+    Raises:
+        ValueError: an unknown split or sensor.
+    """
+
+    split: str
+    seed: int = 0
+    settings: EpisodeSettings = EpisodeSettings()
+
+    def __post_init__(self) -> None:
+        if self.split not in NETWORKS:
+            raise ValueError(f"split must be one of {', '.join(NETWORKS)}, got {self.split!r}")
+        for name in self.settings.lidars:
+            if name not in LIDARS:
+                raise ValueError(f"lidars: no sensor {name!r}; there are: {', '.join(LIDARS)}")
+
+    def episode(self, index: int) -> list[LabelledCloud]:
+        """`snapshots` x `agents` clouds of one world, fewer where there are fewer vehicles that can carry a sensor."""
+        networks = NETWORKS[self.split]
+        rng = np.random.default_rng([self.seed, _EPISODE_STREAM + tuple(NETWORKS).index(self.split), index])
+        world_seed = int(rng.integers(2**31))
+        network = networks[(index + self.seed) % len(networks)]
+        world = World(network, world_seed)
+        names = list(self.settings.lidars)
+        shares = np.array([self.settings.lidars[name] for name in names])
+        lidar = LIDARS[names[rng.choice(len(names), p=shares / shares.sum())]]
+        if self.settings.vary_sensor:
+            lidar = _varied(lidar, rng)
+        clouds = []
+        with Traffic(network, world_seed) as traffic:
+            for snapshot in range(self.settings.snapshots):
+                traffic.step(round(float(rng.uniform(0.5, 1.5)) * self.settings.interval, 1))
+                now = world.at(traffic.vehicles())
+                agents = _agents(now.moving, self.settings.agents, rng)
+                sensors = [(now.sensor_on_vehicle(agent, lidar, rng), agent) for agent in agents]
+                for view in now.views(sensors, [lidar] * len(sensors), snapshot):
+                    clouds.append(_labelled(view, keep_own=rng.random() < self.settings.keep_own_points))
+        return clouds
+
+
+def _varied(lidar: LidarSettings, rng: np.random.Generator) -> LidarSettings:
+    return lidar.model_copy(
+        update={
+            "dropout": float(np.clip(lidar.dropout * rng.uniform(0.3, 2.5), 0.0, 0.6)),
+            "range_noise": float(lidar.range_noise * rng.uniform(0.5, 1.5)),
+            "height": float(lidar.height + rng.uniform(-0.15, 0.25)),
+            "shots": int(lidar.shots * rng.uniform(0.9, 1.15)),
+        }
+    )
+
+
+def _agents(vehicles: Boxes, count: int, rng: np.random.Generator) -> list[int]:
+    """Ids of up to `count` vehicles that may carry a sensor, preferring those that have many others around them."""
+    assert vehicles.track_id is not None
+    assert vehicles.label is not None
+    able = np.flatnonzero(np.isin(vehicles.label, _AGENT_KINDS))
+    if not len(able):
+        return []
+    xy = vehicles.center[:, :2]
+    around = (np.hypot(*(xy[able, None] - xy[None]).transpose(2, 0, 1)) < 50.0).sum(axis=1)
+    weight = around / around.sum()
+    chosen = rng.choice(able, size=min(count, len(able)), replace=False, p=weight)
+    ids: list[int] = vehicles.track_id[chosen].tolist()
+    return ids
+
+
+def _labelled(view: LidarView, keep_own: bool) -> LabelledCloud:
+    points = view.points if keep_own else view.points[~view.own]
+    return LabelledCloud(points, view.boxes, view.point_count)

@@ -1,0 +1,126 @@
+"""Triangle meshes with what a LiDAR needs to know of a surface, and the primitives that shapes are put together from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from cobevglue.typing import ArrayLike, Float32Array
+
+__all__ = ["Mesh", "box", "cylinder", "ellipsoid", "leaves", "quads"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Mesh:
+    """T triangles.
+
+    Attributes:
+        triangles: (T, 3, 3) float32 corners [m], axes x forward, y left, z up.
+        reflectivity: (T,) float32 share of the light that comes back, 0 to 1.
+        transmission: (T,) float32 probability that a ray goes on through: 0 for a wall, near 1 for clear glass.
+    """
+
+    triangles: Float32Array
+    reflectivity: Float32Array
+    transmission: Float32Array
+
+    @staticmethod
+    def of(triangles: ArrayLike, reflectivity: float = 0.5, transmission: float = 0.0) -> Mesh:
+        """Triangles (T, 3, 3) of one material."""
+        corners = np.asarray(triangles, dtype=np.float32).reshape(-1, 3, 3)
+        count = len(corners)
+        return Mesh(
+            corners, np.full(count, reflectivity, dtype=np.float32), np.full(count, transmission, dtype=np.float32)
+        )
+
+    @staticmethod
+    def concatenate(meshes: Sequence[Mesh]) -> Mesh:
+        """All triangles of several meshes, in their order."""
+        if not meshes:
+            return Mesh.of(np.zeros((0, 3, 3)))
+        return Mesh(
+            np.concatenate([mesh.triangles for mesh in meshes]),
+            np.concatenate([mesh.reflectivity for mesh in meshes]),
+            np.concatenate([mesh.transmission for mesh in meshes]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    def moved(self, xyz: ArrayLike, yaw: float = 0.0, scale: ArrayLike = 1.0) -> Mesh:
+        """Scaled about the origin, turned about z by `yaw` [rad], then shifted by `xyz` [m]."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        corners = (self.triangles * np.asarray(scale, dtype=np.float64)) @ turn.T + np.asarray(xyz, dtype=np.float64)
+        return Mesh(corners.astype(np.float32), self.reflectivity, self.transmission)
+
+    def bounds(self) -> tuple[Float32Array, Float32Array]:
+        """(3,) lower and (3,) upper corner of the axis-aligned box around all triangles."""
+        corners = self.triangles.reshape(-1, 3)
+        return corners.min(axis=0), corners.max(axis=0)
+
+
+def box(center: ArrayLike, size: ArrayLike, yaw: float = 0.0, reflectivity: float = 0.5) -> Mesh:
+    """A closed cuboid: (3,) centre [m], (3,) size along its own axes [m]."""
+    return Mesh.of(_unit_box(), reflectivity).moved(center, yaw, size)
+
+
+def cylinder(
+    center: ArrayLike, radius: float, height: float, reflectivity: float = 0.5, axis: str = "z", sides: int = 8
+) -> Mesh:
+    """A closed cylinder about its centre, along the axis "z" or "y"."""
+    corners = _unit_cylinder(sides) * np.array([radius, radius, height], dtype=np.float32)
+    if axis == "y":
+        corners = corners[:, :, [0, 2, 1]]
+    return Mesh.of(corners + np.asarray(center, dtype=np.float32), reflectivity)
+
+
+def ellipsoid(center: ArrayLike, radii: ArrayLike, reflectivity: float = 0.5) -> Mesh:
+    """A coarse ellipsoid of 80 triangles: (3,) centre and (3,) half axes [m]."""
+    return Mesh.of(_unit_sphere(), reflectivity).moved(center, 0.0, radii)
+
+
+def leaves(
+    center: ArrayLike,
+    radii: ArrayLike,
+    count: int,
+    rng: np.random.Generator,
+    leaf: float = 0.5,
+    reflectivity: float = 0.4,
+) -> Mesh:
+    """Foliage: `count` small triangles with edges of about `leaf` [m], at random all over an ellipsoid."""
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    middle = direction * rng.uniform(0.3, 1.0, size=(count, 1)) ** (1 / 3) * np.asarray(radii, dtype=np.float64)
+    corners = middle[:, None, :] + rng.normal(scale=leaf / 2, size=(count, 3, 3))
+    return Mesh.of(corners + np.asarray(center, dtype=np.float64), reflectivity)
+
+
+def quads(corners: ArrayLike, reflectivity: float = 0.5, transmission: float = 0.0) -> Mesh:
+    """Two triangles for each of Q four-cornered faces, given as (Q, 4, 3) corners in order around the face."""
+    faces = np.asarray(corners, dtype=np.float32).reshape(-1, 4, 3)
+    return Mesh.of(np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]), reflectivity, transmission)
+
+
+@cache
+def _unit_box() -> Float32Array:
+    import trimesh
+
+    return np.asarray(trimesh.creation.box().triangles, dtype=np.float32)
+
+
+@cache
+def _unit_cylinder(sides: int) -> Float32Array:
+    import trimesh
+
+    return np.asarray(trimesh.creation.cylinder(radius=1.0, height=1.0, sections=sides).triangles, dtype=np.float32)
+
+
+@cache
+def _unit_sphere() -> Float32Array:
+    import trimesh
+
+    return np.asarray(trimesh.creation.icosphere(subdivisions=1).triangles, dtype=np.float32)
