@@ -1,0 +1,230 @@
+"""Anchors: the boxes that the head starts from, what it has to say of each, and back.
+
+After SECOND (Yan et al., Sensors 2018), section 3.2. All in numpy, so that data-loader workers can do it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cobevglue.perception.config import STRIDES, PointPillarsConfig
+from cobevglue.se2 import wrap_angle
+from cobevglue.typing import ArrayLike, BoolArray, Float32Array, FloatArray, IntArray
+
+__all__ = ["AnchorGrid", "Targets", "assign_targets"]
+
+_LARGEST = 3.0
+"""Residuals of size are cut here when decoded: no box is more than e^3 = 20 times its anchor."""
+_NEARER = 1e-4
+"""Overlap that a metre to the anchor's centre is worth, to choose among those that cover a small object alike."""
+
+
+class AnchorGrid:
+    """The N = rows x columns x types anchors of a configuration, and boxes told relative to them.
+
+    A box (x, y, z, l, w, h, yaw) relative to anchor a is told by seven residuals,
+
+        (x - x_a) / d,  (y - y_a) / d,  (z - z_a) / h_a,  log(l / l_a),  log(w / w_a),  log(h / h_a),  yaw - yaw_a
+
+    with d the diagonal of the anchor seen from above. The last is taken modulo pi, in (-pi/2, pi/2], and the direction
+    says which half turn: 0, the box faces along the anchor, or 1, against it. SECOND cuts directions at a fixed angle,
+    where two headings that differ by nothing get opposite labels; relative to an anchor that was assigned for being
+    the nearest of 0 and 90 degrees that cut is out of reach.
+
+    Attributes:
+        rows: cells along y, from y_min.
+        columns: cells along x, from x_min.
+        cell: side of a cell [m].
+        origin: (2,) x_min and y_min [m].
+        size: (T, 3) length, width, height of the types [m].
+        yaw: (T,) [rad].
+        z: (T,) height of the centre [m].
+    """
+
+    def __init__(self, config: PointPillarsConfig) -> None:
+        self.config = config
+        self.rows, self.columns, self.types = config.head_shape
+        self.cell = config.pillar * STRIDES[0]
+        self.origin = np.array([config.x_range[0], config.y_range[0]])
+        self.size = np.repeat([[a.length, a.width, a.height] for a in config.anchors], 2, axis=0)
+        self.yaw = np.tile([0.0, math.pi / 2], len(config.anchors))
+        self.z = np.repeat([a.z for a in config.anchors], 2)
+
+    def __len__(self) -> int:
+        return self.rows * self.columns * self.types
+
+    @property
+    def extent(self) -> FloatArray:
+        """(T, 2) sides of the types along x and y [m]."""
+        turned = self.yaw[:, None] > 0
+        extent: FloatArray = np.where(turned, self.size[:, 1::-1], self.size[:, :2])
+        return extent
+
+    @property
+    def diagonal(self) -> FloatArray:
+        """(T,) diagonals of the types seen from above [m]."""
+        diagonal: FloatArray = np.hypot(self.size[:, 0], self.size[:, 1])
+        return diagonal
+
+    def boxes(self, index: ArrayLike) -> FloatArray:
+        """(P, 7) x, y, z, l, w, h, yaw of these anchors (P,)."""
+        cell, kind = np.divmod(np.asarray(index, dtype=np.int64), self.types)
+        row, column = np.divmod(cell, self.columns)
+        x, y = (self.origin + (np.stack([column, row], axis=-1) + 0.5) * self.cell).T
+        return np.column_stack([x, y, self.z[kind], self.size[kind], self.yaw[kind]])
+
+    def encode(self, boxes: FloatArray, index: ArrayLike) -> tuple[FloatArray, IntArray]:
+        """Residuals (P, 7) and directions (P,) that tell boxes (P, 7) relative to anchors `index` (P,)."""
+        anchors = self.boxes(index)
+        diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
+        turn = wrap_angle(boxes[:, 6] - anchors[:, 6])
+        against = np.abs(turn) > math.pi / 2
+        residuals = np.column_stack(
+            [
+                (boxes[:, :2] - anchors[:, :2]) / diagonal,
+                (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
+                np.log(boxes[:, 3:6] / anchors[:, 3:6]),
+                _half_turn(turn),
+            ]
+        )
+        return residuals, against.astype(np.int64)
+
+    def decode(self, residuals: ArrayLike, direction: ArrayLike, index: ArrayLike) -> FloatArray:
+        """The boxes (P, 7) that residuals (P, 7) and directions (P,) of anchors `index` (P,) tell; yaw in [-pi, pi)."""
+        anchors = self.boxes(index)
+        values = np.asarray(residuals, dtype=np.float64)
+        diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
+        return np.column_stack(
+            [
+                anchors[:, :2] + values[:, :2] * diagonal,
+                anchors[:, 2] + values[:, 2] * anchors[:, 5],
+                anchors[:, 3:6] * np.exp(np.clip(values[:, 3:6], -_LARGEST, _LARGEST)),
+                wrap_angle(anchors[:, 6] + _half_turn(values[:, 6]) + math.pi * np.asarray(direction)),
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Targets:
+    """What the head should say of one cloud; anchors that are not named are background.
+
+    Attributes:
+        positive: (P,) anchors that are to find an object, ascending.
+        residuals: (P, 7) float32; see `AnchorGrid`.
+        direction: (P,) 0 or 1.
+        ignored: (I,) anchors that count for neither.
+    """
+
+    positive: IntArray
+    residuals: Float32Array
+    direction: IntArray
+    ignored: IntArray
+
+
+def assign_targets(boxes: ArrayLike, ignore: ArrayLike, anchors: AnchorGrid) -> Targets:
+    """Which anchor is to find which object.
+
+    Overlap is measured with headings rounded to the nearest of 0 and 90 degrees, as in SECOND: axis-aligned boxes are
+    fast to compare, and an anchor need not overlap by luck to learn a rotation. An object to which no anchor comes
+    near enough gets the best there is, so that a motorcycle is learnt too.
+
+    Args:
+        boxes: (K, 7) x, y, z, l, w, h [m], yaw [rad] in the LiDAR's frame.
+        ignore: (K,) True for objects that cannot be asked for, for instance for want of points. They, and those whose
+            centre is out of range, keep the anchors around them from being called background, and are no targets.
+        anchors: the grid.
+
+    Returns:
+        The targets of this cloud.
+
+    Raises:
+        ValueError: wrong shapes, or boxes that are not finite or without size.
+    """
+    boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 7) if np.size(boxes) == 0 else np.asarray(boxes, np.float64)
+    ignore = np.asarray(ignore, dtype=bool)
+    if boxes.ndim != 2 or boxes.shape[1] != 7 or ignore.shape != boxes.shape[:1]:
+        raise ValueError(f"boxes and ignore must have shapes (K, 7) and (K,), got {boxes.shape} and {ignore.shape}")
+    bad = ~np.isfinite(boxes).all(axis=1) | ~(boxes[:, 3:6] > 0).all(axis=1)
+    if bad.any():
+        raise ValueError(f"boxes: row {int(bad.argmax())} is not finite or has no size: {boxes[bad.argmax()].tolist()}")
+
+    config = anchors.config
+    pairs = _overlaps(boxes, anchors)
+    center = (boxes[:, :2] - anchors.origin) / anchors.cell
+    ignore = ignore | (center < 0).any(axis=1) | (center >= [anchors.columns, anchors.rows]).any(axis=1)
+
+    best, owner = np.zeros(len(anchors)), np.full(len(anchors), -1)
+    near = np.flatnonzero(~ignore[pairs.box] & (pairs.iou >= config.negative_iou))
+    near = near[np.argsort(pairs.iou[near], kind="stable")]  # the last one written stays: the best
+    best[pairs.anchor[near]] = pairs.iou[near]
+    owner[pairs.anchor[near]] = pairs.box[near]
+    owner[best < config.positive_iou] = -1
+    neither = best >= config.negative_iou
+    _give_the_rest_their_best(owner, pairs, ~ignore)
+    neither[pairs.anchor[ignore[pairs.box] & (pairs.iou >= config.ignore_iou)]] = True
+
+    positive = np.flatnonzero(owner >= 0)
+    residuals, direction = anchors.encode(boxes[owner[positive]], positive)
+    return Targets(
+        positive, residuals.astype(np.float32), direction, np.flatnonzero(neither & (owner < 0)).astype(np.int64)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """P pairs of a box and an anchor that overlap, by box: rows of both, overlap, distance of the centres [m]."""
+
+    box: IntArray
+    anchor: IntArray
+    iou: FloatArray
+    distance: FloatArray
+
+
+def _overlaps(boxes: FloatArray, anchors: AnchorGrid) -> _Pairs:
+    """All pairs that overlap. Overlap along x depends on the column alone, along y on the row: two small tables."""
+    turned = np.abs(np.sin(boxes[:, 6])) > math.sqrt(0.5)
+    side = np.where(turned[:, None], boxes[:, 4:2:-1], boxes[:, 3:5])  # (K, 2) along x and y
+    reach = (side.max(initial=0.0) + anchors.extent.max()) / 2
+    half = min(math.ceil(reach / anchors.cell), max(anchors.rows, anchors.columns)) + 1
+    limits = anchors.origin, anchors.origin + np.array([anchors.columns, anchors.rows]) * anchors.cell
+    inside = np.flatnonzero(((boxes[:, :2] > limits[0] - reach) & (boxes[:, :2] < limits[1] + reach)).all(axis=1))
+    boxes, side = boxes[inside], side[inside]
+
+    lines, offsets, shared = [], [], []
+    for axis, count in ((0, anchors.columns), (1, anchors.rows)):
+        first = np.floor((boxes[:, axis] - anchors.origin[axis]) / anchors.cell).astype(np.int64)
+        line = first[:, None] + np.arange(-half, half + 1)  # (K, W) columns or rows around the box
+        offset = anchors.origin[axis] + (line + 0.5) * anchors.cell - boxes[:, axis, None]
+        a, b = side[:, None, axis, None] / 2, anchors.extent[None, :, axis, None] / 2
+        both = np.minimum(a, offset[:, None] + b) - np.maximum(-a, offset[:, None] - b)  # (K, T, W)
+        shared.append(np.clip(both, 0.0, None) * ((line >= 0) & (line < count))[:, None])
+        lines.append(line)
+        offsets.append(offset)
+
+    inter = shared[1][..., None] * shared[0][:, :, None]  # (K, T, W rows, W columns)
+    k, t, r, c = np.nonzero(inter)
+    inter = inter[k, t, r, c]
+    iou = inter / (side.prod(axis=1)[k] + anchors.extent.prod(axis=1)[t] - inter)
+    index = (lines[1][k, r] * anchors.columns + lines[0][k, c]) * anchors.types + t
+    return _Pairs(inside[k], index, iou, np.hypot(offsets[0][k, c], offsets[1][k, r]))
+
+
+def _give_the_rest_their_best(owner: IntArray, pairs: _Pairs, wanted: BoolArray) -> None:
+    """Boxes that own no anchor get the best one that is free; of two that want the same, the better fit comes first."""
+    poor = wanted.copy()
+    poor[owner[owner >= 0]] = False
+    merit = pairs.iou - _NEARER * pairs.distance
+    rows = np.flatnonzero(poor[pairs.box])
+    for row in rows[np.argsort(-merit[rows], kind="stable")]:
+        box, anchor = pairs.box[row], pairs.anchor[row]
+        if poor[box] and owner[anchor] < 0:
+            owner[anchor] = box
+            poor[box] = False
+
+
+def _half_turn(angle: FloatArray) -> FloatArray:
+    """The same axis, in (-pi/2, pi/2]."""
+    return angle - math.pi * np.ceil(angle / math.pi - 0.5)

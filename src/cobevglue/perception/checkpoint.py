@@ -1,0 +1,118 @@
+"""Weights on disk: one safetensors file with the settings and what is known of the training in its header.
+
+Such a file holds numbers and text, no code: loading one from a stranger is safe.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+__all__ = ["Checkpoint", "load_checkpoint", "load_weights", "save_checkpoint"]
+
+_FORMAT = "1"
+"""Raised when files of the version before can no longer be read."""
+_MAGIC = "cobevglue_format"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """What a file holds: settings as plain data, weights by name (float32), metadata as it was given."""
+
+    config: dict[str, Any]
+    weights: dict[str, Tensor]
+    metadata: dict[str, Any]
+
+
+def save_checkpoint(
+    path: str | Path,
+    architecture: str,
+    config: Mapping[str, Any],
+    module: nn.Module,
+    metadata: Mapping[str, Any] | None = None,
+    half: bool = False,
+) -> None:
+    """Write the weights of `module`. The file appears complete or not at all.
+
+    Args:
+        path: where to.
+        architecture: name of the kind of network, checked when loading.
+        config: its settings, as JSON can hold them.
+        module: the network.
+        metadata: what else is known: data, metrics, seed; as JSON can hold it.
+        half: weights in float16, for half the size; statistics of the normalisation stay float32.
+    """
+    weights = {}
+    for name, value in module.state_dict().items():
+        narrow = half and value.is_floating_point() and "running_" not in name
+        weights[name] = value.detach().to("cpu", torch.float16 if narrow else value.dtype).contiguous()
+    header = {
+        _MAGIC: _FORMAT,
+        "architecture": architecture,
+        "config": json.dumps(config),
+        "metadata": json.dumps(dict(metadata or {})),
+    }
+    part = Path(path).with_name(f"{Path(path).name}.{os.getpid()}.part")
+    try:
+        save_file(weights, part, header)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def load_checkpoint(path: str | Path, architecture: str) -> Checkpoint:
+    """Read a file that `save_checkpoint` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, not ours, of another version of the format, or of another architecture.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            header = file.metadata() or {}
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path}: damaged, or no safetensors file: {error}") from None
+    if _MAGIC not in header:
+        raise ValueError(f"{path}: a safetensors file, but not one of CoBEVGlue's: its header has no {_MAGIC!r}")
+    if header[_MAGIC] != _FORMAT:
+        raise ValueError(f"{path}: format {header[_MAGIC]}; this version of cobevglue reads format {_FORMAT}")
+    if header.get("architecture") != architecture:
+        raise ValueError(f"{path}: weights of {header.get('architecture')!r}, not of {architecture!r}")
+    try:
+        config, metadata = json.loads(header["config"]), json.loads(header["metadata"])
+    except (KeyError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: damaged header: {error!r}") from None
+    floats = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
+    return Checkpoint(config, floats, metadata)
+
+
+def load_weights(module: nn.Module, weights: Mapping[str, Tensor], path: str | Path) -> None:
+    """Put weights into a network.
+
+    Raises:
+        ValueError: they are not this network's, or not finite; names the first weight that differs.
+    """
+    own = module.state_dict()
+    for name in sorted(own.keys() | weights.keys()):
+        if name not in weights:
+            raise ValueError(f"{path}: weight {name!r} is missing")
+        if name not in own:
+            raise ValueError(f"{path}: weight {name!r} is not part of this network")
+        if own[name].shape != weights[name].shape:
+            shapes = f"{tuple(weights[name].shape)}, this network's {tuple(own[name].shape)}"
+            raise ValueError(f"{path}: weight {name!r} has shape {shapes}")
+        if not torch.isfinite(weights[name]).all():
+            raise ValueError(f"{path}: weight {name!r} is not finite")
+    module.load_state_dict(dict(weights))

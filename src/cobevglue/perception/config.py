@@ -1,0 +1,157 @@
+"""Settings of the detector, and the two that come with the package."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from cobevglue.settings import Settings
+
+__all__ = ["CONFIGS", "STRIDES", "Anchor", "DetectionConfig", "PointPillarsConfig"]
+
+STRIDES = (2, 4, 8)
+"""Of the three feature maps, in pillars: each block of the backbone halves the map."""
+
+_Range = tuple[float, float]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Count = Annotated[int, Field(ge=1)]
+
+
+class Anchor(Settings):
+    """A box that the head starts from, at 0 and at 90 degrees in every cell.
+
+    Attributes:
+        length: along the heading [m].
+        width: across it [m].
+        height: [m].
+        z: height of its centre in the LiDAR's frame [m].
+    """
+
+    length: _Positive
+    width: _Positive
+    height: _Positive
+    z: Annotated[float, Field(allow_inf_nan=False)]
+
+
+class DetectionConfig(Settings):
+    """How boxes are chosen from what the head says. No part of the weights: change it as you like.
+
+    Attributes:
+        score_threshold: boxes that score less are not looked at.
+        candidates: how many of the best-scored go into non-maximum suppression.
+        nms_iou: rotated overlap up to which two boxes may both stay.
+        max_detections: how many stay at most.
+        uncertainty_penalty: rank by score * exp(-penalty * standard deviation of x and y [m]) instead of the score; 0
+            ranks by the score. The scores handed out stay what they are.
+        variance_voting: let the suppressed boxes move those that stay: average of all that overlap by `voting_iou` or
+            more, weighted by the overlap and the inverse predicted variance (He et al., "Bounding Box Regression with
+            Uncertainty for Accurate Object Detection", CVPR 2019).
+        voting_iou: see there.
+    """
+
+    score_threshold: _Share = 0.1
+    candidates: _Count = 500
+    nms_iou: _Share = 0.15
+    max_detections: _Count = 120
+    uncertainty_penalty: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    variance_voting: bool = False
+    voting_iou: _Share = 0.5
+
+
+class PointPillarsConfig(Settings):
+    """Settings of `PointPillars`: what it sees, the network's size, its anchors.
+
+    Attributes:
+        x_range: what is looked at along x, in the LiDAR's frame [m].
+        y_range: along y [m].
+        z_range: along z [m].
+        pillar: side of a pillar [m].
+        use_intensity: give the network the points' intensity; not where each sensor means something else by it.
+        pillar_channels: channels of the pseudo-image.
+        block_layers: residual blocks at strides 2, 4 and 8.
+        block_channels: their channels.
+        up_channels: channels that each of the three maps is brought to at stride 2.
+        shrink_channels: channels of the map the heads look at.
+        shrink_kernel: kernel of the first of the two convolutions that get there; the second is 3 x 3.
+        anchors: box sizes in every cell, each at 0 and 90 degrees.
+        positive_iou: anchors that overlap an object by this are to find it.
+        negative_iou: anchors that overlap all objects by less are background; what lies between counts for neither.
+        ignore_iou: anchors that overlap an object that cannot be asked for (too few points) by this count for neither.
+        detection: how boxes are chosen.
+
+    Raises:
+        ValueError: a value out of range, an unknown field, an empty range, or one that is no multiple of 8 pillars.
+    """
+
+    x_range: _Range = (-70.4, 70.4)
+    y_range: _Range = (-40.0, 40.0)
+    z_range: _Range = (-3.0, 1.0)
+    pillar: _Positive = 0.4
+    use_intensity: bool = False
+    pillar_channels: _Count = 32
+    block_layers: tuple[_Count, _Count, _Count] = (1, 2, 2)
+    block_channels: tuple[_Count, _Count, _Count] = (48, 96, 128)
+    up_channels: _Count = 64
+    shrink_channels: _Count = 64
+    shrink_kernel: Annotated[int, Field(ge=1, le=3)] = 1
+    anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)] = (
+        Anchor(length=4.4, width=2.0, height=1.6, z=-1.0),
+        Anchor(length=9.0, width=2.6, height=3.3, z=-0.2),
+    )
+    positive_iou: _Share = 0.5
+    negative_iou: _Share = 0.35
+    ignore_iou: _Share = 0.2
+    detection: DetectionConfig = DetectionConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> PointPillarsConfig:
+        for name, count in (("x_range", self.columns), ("y_range", self.rows)):
+            low, high = getattr(self, name)
+            if not low < high or count % STRIDES[-1] or abs(count * self.pillar - (high - low)) > 1e-6 * (high - low):
+                raise ValueError(
+                    f"{name}: {low} to {high} m is not a multiple of {STRIDES[-1]} pillars of {self.pillar} m"
+                )
+        if not self.z_range[0] < self.z_range[1]:
+            raise ValueError(f"z_range: {self.z_range[0]} to {self.z_range[1]} m is empty")
+        if self.shrink_kernel == 2:
+            raise ValueError("shrink_kernel: must be odd, 1 or 3, got 2")
+        if self.negative_iou > self.positive_iou:
+            raise ValueError(f"negative_iou: {self.negative_iou} is above positive_iou, {self.positive_iou}")
+        return self
+
+    @property
+    def rows(self) -> int:
+        """Pillars along y: rows of the pseudo-image, from y_min to y_max."""
+        return round((self.y_range[1] - self.y_range[0]) / self.pillar)
+
+    @property
+    def columns(self) -> int:
+        """Pillars along x: columns of the pseudo-image, from x_min to x_max."""
+        return round((self.x_range[1] - self.x_range[0]) / self.pillar)
+
+    @property
+    def head_shape(self) -> tuple[int, int, int]:
+        """Rows, columns and anchors per cell of what the head says."""
+        return self.rows // STRIDES[0], self.columns // STRIDES[0], 2 * len(self.anchors)
+
+
+CONFIGS: dict[str, PointPillarsConfig] = {
+    "opv2v": PointPillarsConfig(
+        x_range=(-140.8, 140.8),
+        use_intensity=True,
+        pillar_channels=64,
+        block_layers=(3, 5, 8),
+        block_channels=(64, 128, 256),
+        up_channels=128,
+        shrink_channels=256,
+        shrink_kernel=3,
+        anchors=(Anchor(length=3.9, width=1.6, height=1.56, z=-1.0),),
+        positive_iou=0.6,
+        negative_iou=0.45,
+    ),
+    "compact": PointPillarsConfig(),
+}
+"""`opv2v`: the size that the papers on OPV2V use (with residual blocks, as CoAlign and CoBEVGlue do), for a GPU.
+`compact`: about a million weights, for a CPU; roadside LiDARs, vans, buses and lorries too."""

@@ -1,0 +1,79 @@
+"""From what the head says to boxes: the best-scored candidates, non-maximum suppression, and how sure each box is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from cobevglue.boxes import Boxes
+from cobevglue.iou import bev_iou, nms
+from cobevglue.perception.anchors import AnchorGrid
+from cobevglue.perception.config import DetectionConfig
+from cobevglue.perception.head import HeadOutput
+from cobevglue.perception.loss import MAX_LOG_VARIANCE, MIN_LOG_VARIANCE
+from cobevglue.se2 import wrap_angle
+from cobevglue.typing import FloatArray
+
+__all__ = ["LABEL", "decode"]
+
+LABEL = "vehicle"
+"""The one class there is."""
+_TEMPERATURE = 0.05
+"""How fast a box's vote falls with its overlap: exp(-(1 - IoU)^2 / temperature) (He et al., CVPR 2019, equation 12)."""
+
+
+def decode(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> list[tuple[Boxes, FloatArray]]:
+    """The boxes of each cloud, best first, and how sure they are.
+
+    Args:
+        output: what the head says of B clouds.
+        anchors: the grid it was said of.
+        config: how to choose.
+
+    Returns:
+        For each cloud its K boxes in the LiDAR's frame, with score and label, and the (K, 3) variance of x, y [m^2]
+        and yaw [rad^2].
+    """
+    return [_decode_one(HeadOutput(*(v[b] for v in output)), anchors, config) for b in range(len(output.logits))]
+
+
+def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> tuple[Boxes, FloatArray]:
+    count = min(config.candidates, len(output.logits))
+    logits, index = output.logits.float().topk(count)
+    kept = torch.sigmoid(logits) >= config.score_threshold
+    logits, index = logits[kept], index[kept]
+
+    def chosen(values: torch.Tensor) -> FloatArray:
+        return values[index].double().cpu().numpy()
+
+    values = anchors.decode(chosen(output.residuals), chosen(output.direction).argmax(axis=1), index.cpu().numpy())
+    variance = np.exp(np.clip(chosen(output.log_variance), MIN_LOG_VARIANCE, MAX_LOG_VARIANCE))
+    score = torch.sigmoid(logits).double().cpu().numpy()
+    candidates = Boxes(values[:, :3], values[:, 3:6], values[:, 6], score, label=np.full(len(values), LABEL))
+
+    deviation = np.sqrt(variance[:, :2].sum(axis=1))
+    ranked = candidates.replace(score=score * np.exp(-config.uncertainty_penalty * deviation))
+    rows = nms(ranked, config.nms_iou)[: config.max_detections]
+    boxes = candidates[rows]
+    if config.variance_voting and len(boxes):
+        boxes = _vote(boxes, candidates, variance, config.voting_iou)
+    return boxes, variance[rows]
+
+
+def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, min_iou: float) -> Boxes:
+    """K boxes moved to what the C candidates that overlap them say on average; `variance` is the candidates' (C, 3)."""
+    iou = bev_iou(boxes, candidates)
+    vote = np.where(iou >= min_iou, np.exp(-((1.0 - iou) ** 2) / _TEMPERATURE), 0.0)
+
+    def average(values: FloatArray, weight: FloatArray) -> FloatArray:
+        mean: FloatArray = (weight[..., None] * values).sum(axis=1) / weight.sum(axis=1)[:, None]
+        return mean
+
+    xy = np.column_stack([average(candidates.center[None, :, i, None], vote / variance[:, i])[:, 0] for i in range(2)])
+    turn = candidates.yaw - boxes.yaw[:, None]
+    turn -= math.pi * np.round(turn / math.pi)  # a flipped candidate knows the axis all the same
+    yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0])
+    rest = average(np.column_stack([candidates.center[:, 2], candidates.size])[None], vote)
+    return boxes.replace(center=np.column_stack([xy, rest[:, 0]]), size=rest[:, 1:], yaw=yaw)

@@ -1,0 +1,228 @@
+"""The detector: PointPillars with a residual backbone, in plain PyTorch."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+from torch import Tensor, nn
+
+from cobevglue.boxes import Boxes
+from cobevglue.perception.anchors import AnchorGrid
+from cobevglue.perception.backbone import Backbone, Neck
+from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from cobevglue.perception.config import PointPillarsConfig
+from cobevglue.perception.decode import decode
+from cobevglue.perception.head import Head, HeadOutput
+from cobevglue.perception.pillars import PillarEncoder, batch_clouds
+from cobevglue.typing import ArrayLike, Float32Array, FloatArray
+
+__all__ = ["PointPillars", "check_points"]
+
+_ARCHITECTURE = "point_pillars"
+_WEIGHTS = Path(__file__).parent / "weights"
+
+
+class PointPillars(nn.Module):
+    """Finds vehicles in a point cloud (Lang et al., "PointPillars", CVPR 2019).
+
+        detector = PointPillars.pretrained("compact")
+        boxes = detector.detect(points)  # (N, 4) x, y, z, intensity
+
+    In three steps, so that fusion fits between: `forward` is `decode_features(multiscale(encode(clouds)))`. All maps
+    are (B, C, rows, columns); rows go along y and columns along x, both from min to max.
+
+    Args:
+        config: settings; `CONFIGS` has two. Weights are random, from torch's generator.
+
+    Attributes:
+        config: the settings.
+        detection: how boxes are chosen, `config.detection` at first; may be changed at any time.
+        anchors: the boxes that the head starts from.
+        metadata: what the file said that the weights are from.
+    """
+
+    def __init__(self, config: PointPillarsConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.detection = config.detection
+        self.anchors = AnchorGrid(config)
+        self.metadata: dict[str, Any] = {}
+        self.pillars = PillarEncoder(config)
+        self.backbone = Backbone(config)
+        self.neck = Neck(config)
+        self.head = Head(config)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster so
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.pillars.linear.weight.device
+
+    def encode(self, clouds: Sequence[Tensor]) -> Tensor:
+        """B clouds (N_i, 4) x, y, z [m], intensity, as a pseudo-image (B, pillar_channels, rows, columns).
+
+        Points out of range or not finite are dropped; a cloud may be empty.
+        """
+        points, cloud = batch_clouds([c.to(self.device, torch.float32, non_blocking=True) for c in clouds])
+        image: Tensor = self.pillars(points, cloud, len(clouds))
+        return image
+
+    def multiscale(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The pseudo-image as three maps at strides 2, 4 and 8: what agents share."""
+        maps: tuple[Tensor, Tensor, Tensor] = self.backbone(image)
+        return maps
+
+    def decode_features(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """What the head says of three maps, one agent's or fused."""
+        output: HeadOutput = self.head(self.neck(maps))
+        return output
+
+    def forward(self, clouds: Sequence[Tensor]) -> HeadOutput:
+        """What the head says of B clouds (N_i, 4) x, y, z [m], intensity."""
+        return self.decode_features(self.multiscale(self.encode(clouds)))
+
+    def boxes(self, output: HeadOutput) -> list[tuple[Boxes, FloatArray]]:
+        """For each cloud its K boxes, best first, and their (K, 3) variance of x, y [m^2] and yaw [rad^2]."""
+        return decode(output, self.anchors, self.detection)
+
+    def detect(self, points: ArrayLike) -> Boxes:
+        """The vehicles in one cloud.
+
+        Args:
+            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped.
+
+        Returns:
+            Boxes in the LiDAR's frame, best first, with score and label.
+
+        Raises:
+            ValueError: `points` is not numbers of shape (N, 4).
+        """
+        return self.detect_batch([points])[0]
+
+    def detect_batch(self, clouds: Sequence[ArrayLike]) -> list[Boxes]:
+        """The vehicles in each of several clouds, see `detect`."""
+        return [boxes for boxes, _ in self._detect(clouds)]
+
+    def detect_with_uncertainty(self, points: ArrayLike) -> tuple[Boxes, FloatArray]:
+        """The K vehicles in one cloud, and the (K, 3) variance of x, y [m^2] and yaw [rad^2] of each."""
+        return self._detect([points])[0]
+
+    @torch.inference_mode()
+    def _detect(self, clouds: Sequence[ArrayLike]) -> list[tuple[Boxes, FloatArray]]:
+        if not clouds:
+            return []
+        tensors = [torch.from_numpy(check_points(points)) for points in clouds]
+        with self._evaluating():
+            return self.boxes(self(tensors))
+
+    def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
+        """Write settings, weights and metadata (as JSON can hold it) to one safetensors file.
+
+        Args:
+            path: where to; the file appears complete or not at all.
+            metadata: data, metrics, seed, whatever should be known of the weights.
+            half: in float16, for half the size.
+        """
+        config = json.loads(self.config.model_dump_json())
+        save_checkpoint(path, _ARCHITECTURE, config, self, {**self.metadata, **(metadata or {})}, half)
+
+    @classmethod
+    def load(cls, path: str | Path) -> PointPillars:
+        """The detector that `save` wrote, on the CPU and ready to detect.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is damaged, not ours, or of another format, network or shape; says which.
+        """
+        checkpoint = load_checkpoint(path, _ARCHITECTURE)
+        try:
+            config = PointPillarsConfig.model_validate(checkpoint.config)
+        except ValidationError as error:
+            raise ValueError(f"{path}: settings that this version of cobevglue does not take: {error}") from None
+        detector = cls(config)
+        load_weights(detector, checkpoint.weights, path)
+        detector.metadata = checkpoint.metadata
+        return detector.eval()
+
+    @classmethod
+    def pretrained(cls, name: str) -> PointPillars:
+        """The detector of this name that comes with the package.
+
+        Raises:
+            ValueError: there is none; names the nearest.
+        """
+        names = sorted(path.stem for path in _WEIGHTS.glob("*.safetensors"))
+        if name not in names:
+            near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)
+            hint = f"did you mean {near[0]!r}?" if near else f"{_WEIGHTS} has none"
+            raise ValueError(f"no pretrained detector {str(name)!r}; {hint}")
+        return cls.load(_WEIGHTS / f"{name}.safetensors")
+
+    def export_onnx(self, path: str | Path) -> None:
+        """Write everything behind the pillars as an ONNX model: pseudo-images in, what the head says out.
+
+        Input `image` (B, pillar_channels, rows, columns), B free; outputs as named in `HeadOutput`. Grouping points
+        into pillars has no counterpart in ONNX that is worth it: that stays `encode`, and what follows stays `boxes`.
+        """
+        shape = 1, self.config.pillar_channels, self.config.rows, self.config.columns
+        names = list(HeadOutput._fields)
+        with self._evaluating():
+            torch.onnx.export(
+                _BehindPillars(self),
+                (torch.zeros(shape, device=self.device),),
+                str(path),
+                input_names=["image"],
+                output_names=names,
+                dynamic_axes={name: {0: "batch"} for name in ("image", *names)},
+                opset_version=17,
+                dynamo=False,
+            )
+
+    @contextmanager
+    def _evaluating(self) -> Iterator[None]:
+        """Evaluation mode for a while, whatever the mode was."""
+        training = self.training
+        if training:
+            self.eval()
+        try:
+            yield
+        finally:
+            if training:
+                self.train()
+
+
+class _BehindPillars(nn.Module):
+    def __init__(self, detector: PointPillars) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, image: Tensor) -> HeadOutput:
+        return self.detector.decode_features(self.detector.multiscale(image))
+
+
+def check_points(points: ArrayLike) -> Float32Array:
+    """A point cloud (N, 4) in float32.
+
+    Raises:
+        ValueError: not numbers, or of another shape; says what it is instead.
+    """
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise ValueError(f"points must have shape (N, 4): {error}") from None
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"points must be numbers, got {array.dtype}")
+    if array.size == 0 and array.ndim == 1:
+        array = array.reshape(0, 4)
+    if array.ndim != 2 or array.shape[1] != 4:
+        raise ValueError(f"points must have shape (N, 4): x, y, z [m], intensity; got {array.shape}")
+    with np.errstate(over="ignore"):  # what is too large for float32 is out of range too
+        return np.ascontiguousarray(array, dtype=np.float32)
