@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cobevglue.cli.errors import expected_errors
-from cobevglue.cli.output import print_json, print_note, print_table
+from cobevglue.cli.errors import InputError
+from cobevglue.cli.evaluate_align import evaluate_align
+from cobevglue.cli.evaluate_detect import DetectTask, evaluate_detect
 
 __all__ = ["Dataset", "Task", "evaluate"]
 
@@ -19,65 +19,93 @@ class Task(str, Enum):
     """What can be evaluated."""
 
     ALIGN = "align"
+    DETECT = "detect"
 
 
 class Dataset(str, Enum):
-    """Data sets with exact poses and object ids, whose labels stand in for detections."""
+    """Data sets by name; `simulated` is made on the way."""
 
     OPV2V = "opv2v"
     V2XSET = "v2xset"
+    V2V4REAL = "v2v4real"
+    DAIR_V2X = "dair-v2x"
+    SIMULATED = "simulated"
+
+
+_ONLY_FOR = {
+    Task.ALIGN: ("max_range", "perfect", "paper"),
+    Task.DETECT: ("weights", "reach", "min_points", "scenario", "frames", "picture", "failures"),
+}
+"""Options that one task knows and the other does not."""
 
 
 def evaluate(
-    root: Annotated[Path, typer.Option(help="Root of the data set.")],
+    context: typer.Context,
+    root: Annotated[Path | None, typer.Option(help="Root of the data set; none for simulated.")] = None,
     task: Annotated[Task, typer.Option(help="What to evaluate.")] = Task.ALIGN,
     dataset: Annotated[Dataset, typer.Option(help="Format of the data set.")] = Dataset.OPV2V,
     split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
-    max_range: Annotated[float, typer.Option(min=1.0, help="Objects farther away are not detected [m].")] = 70.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the detection errors, or of simulated worlds.")] = 0,
+    max_range: Annotated[float, typer.Option(min=1.0, help="align: objects farther away are not detected [m].")] = 70.0,
     perfect: Annotated[
-        bool, typer.Option("--perfect", help="Labels as they are, without a detector's errors.")
+        bool, typer.Option("--perfect", help="align: labels as they are, without a detector's errors.")
     ] = False,
-    paper: Annotated[bool, typer.Option("--paper", help="The paper's own settings instead of the default.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the detection errors.")] = 0,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="align: the paper's own settings instead of the default.")
+    ] = False,
+    weights: Annotated[str, typer.Option(help="detect: a shipped model's name, or a .safetensors file.")] = "compact",
+    reach: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--range", help="detect: objects count up to this |x| and |y| [m]; else as far as the model looks."
+        ),
+    ] = None,
+    min_points: Annotated[int, typer.Option(min=0, help="detect: objects with fewer points are ignored.")] = 0,
+    scenario: Annotated[str | None, typer.Option(help="detect: go through this scenario only.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="detect: look at this many clouds at most; 100 of simulated ones.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="detect: folder for a picture of every tenth cloud.")] = None,
+    failures: Annotated[
+        Path | None, typer.Option(help="detect: CSV file for every missed object and false detection.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Measure BEVGlue on every pair of agents of a data set, by the number of objects both detected.
+    """Measure the alignment (`--task align`) or the detector (`--task detect`) on a data set.
 
-    The labels get a detector's errors (missed, displaced, flipped and false boxes) and are tracked. Poses of the data
-    set are the truth and never reach the alignment. Wrong is what is accepted and off by more than 3 m or 3 degrees.
+    align: BEVGlue on every pair of agents, by the number of objects both detected. The labels get a detector's errors
+    (missed, displaced, flipped and false boxes) and are tracked. Poses of the data set are the truth and never reach
+    the alignment. Wrong is what is accepted and off by more than 3 m or 3 degrees.
+
+    detect: PointPillars on every agent's own cloud against that agent's own labels: average precision by distance, in
+    both of its dialects, and what is wrong with the boxes found.
     """
-    from cobevglue import BEVGlue, BEVGlueConfig
-    from cobevglue.datasets import OPV2V, V2XSet
-    from cobevglue.disturbance.detection_errors import DetectionErrors
-    from cobevglue.evaluation.alignment import by_co_visible, off_by_3
-    from cobevglue.evaluation.alignment import evaluate as run
-    from cobevglue.evaluation.alignment_data import noisy_label_sequences
-
-    reader = OPV2V if dataset is Dataset.OPV2V else V2XSet
-    errors = DetectionErrors.none() if perfect else DetectionErrors()
-    config = BEVGlueConfig.paper() if paper else BEVGlueConfig()
-    records = []
-    with expected_errors():
-        for sequence in noisy_label_sequences(reader(root, split), errors, seed, max_range):
-            records += list(run([sequence], lambda: BEVGlue(config)))
-            print_note(f"{sequence.name}: {len(sequence.frames)} frames")
-    groups = by_co_visible(records, off_by_3)
-    if as_json:
-        print_json({name: dataclasses.asdict(group) for name, group in groups.items()})
+    _refuse_options_of_others(context, task)
+    if task is Task.DETECT:
+        wanted = DetectTask(
+            root, dataset.value, split, weights, reach, min_points, scenario, frames, seed, picture, failures
+        )
+        evaluate_detect(wanted, as_json)
         return
-    print_table(
-        f"BEVGlue on {dataset.value} {split}, objects within {max_range:.0f} m",
-        ("co-visible", "frames", "@1", "@2", "@3", "refused", "wrong of accepted", "precision", "recall", "ms"),
-        [
-            (
-                name,
-                str(g.frames),
-                *(f"{100 * share:.1f} %" for share in (g.success_1, g.success_2, g.success_3, g.refused)),
-                f"{100 * g.wrong_of_accepted:.2f} %",
-                f"{100 * g.match_precision:.1f} %",
-                f"{100 * g.match_recall:.1f} %",
-                f"{g.median_milliseconds:.2f}",
-            )
-            for name, g in groups.items()
-        ],
+    if root is None:
+        raise InputError("--task align needs --root, the folder of the data set")
+    evaluate_align(
+        root,
+        dataset.value,
+        split,
+        max_range=max_range,
+        perfect=perfect,
+        paper=paper,
+        seed=seed,
+        as_json=as_json,
     )
+
+
+def _refuse_options_of_others(context: typer.Context, task: Task) -> None:
+    """An option that would have no effect is an error."""
+    for other, names in _ONLY_FOR.items():
+        for name in names if other is not task else ():
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":
+                option = "--" + ("range" if name == "reach" else name.replace("_", "-"))
+                raise InputError(f"{option} is for --task {other.value}, and has no effect on --task {task.value}")

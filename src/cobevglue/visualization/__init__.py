@@ -2,6 +2,7 @@
 
 from cobevglue.visualization.alignment import draw_alignment
 from cobevglue.visualization.bev import draw_agent, draw_boxes, draw_object_graph, draw_pairs
+from cobevglue.visualization.detections import draw_detections, draw_points
 from cobevglue.visualization.report_page import Section, Table, write_page
 from cobevglue.visualization.style import EGO, MATCH, OTHER, TRUTH, add_axes, new_figure, save_figure, style_bev
 
@@ -16,8 +17,10 @@ __all__ = [
     "draw_agent",
     "draw_alignment",
     "draw_boxes",
+    "draw_detections",
     "draw_object_graph",
     "draw_pairs",
+    "draw_points",
     "new_figure",
     "save_figure",
     "style_bev",

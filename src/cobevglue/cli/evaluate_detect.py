@@ -1,0 +1,295 @@
+"""`cobevglue evaluate --task detect`: PointPillars on every agent's own clouds."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import statistics
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cobevglue.cli.errors import InputError, expected_errors
+from cobevglue.cli.output import print_json, print_note, print_table
+
+if TYPE_CHECKING:
+    from cobevglue.evaluation.detection import BoxErrors, DetectionReport, GroupScore
+    from cobevglue.evaluation.detection_data import Cloud
+    from cobevglue.evaluation.detection_matching import DetectionFrame, EvaluationRange
+    from cobevglue.perception import PointPillars
+
+__all__ = ["SIMULATED", "DetectTask", "evaluate_detect"]
+
+SIMULATED = "simulated"
+"""In the place of a data set's name: clouds that are made on the way."""
+
+_SIMULATED_CLOUDS = 100  # where the user does not say how many
+_PICTURE_EVERY = 10  # clouds
+_NOTE_EVERY = 10.0  # seconds
+_SCORE_THRESHOLD = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectTask:
+    """What to evaluate, as the user says it.
+
+    Attributes:
+        root: of the data set; None for simulated clouds.
+        dataset: name of the data set, or "simulated".
+        split: name of the split.
+        weights: a shipped model's name, or a file that ends in .safetensors.
+        reach: |x| and |y| up to which objects count [m]; None for as far as the detector looks.
+        min_points: objects with fewer points are ignored.
+        scenario: the only one to go through; None for all.
+        frames: how many clouds to look at, at most; None for all of a data set.
+        seed: of simulated worlds.
+        pictures: folder for pictures, or None.
+        failures: file for a list of what was missed and made up, or None.
+    """
+
+    root: Path | None
+    dataset: str
+    split: str
+    weights: str
+    reach: tuple[float, float] | None
+    min_points: int
+    scenario: str | None
+    frames: int | None
+    seed: int
+    pictures: Path | None
+    failures: Path | None
+
+    @property
+    def data(self) -> str:
+        """The data's name for titles."""
+        return " ".join(part for part in (self.dataset, self.split, self.scenario) if part)
+
+
+@dataclasses.dataclass
+class _Counts:
+    """What happened on the way: agents' frames without a cloud, and the time that each of the clouds took [s]."""
+
+    without_cloud: int = 0
+    seconds: list[float] = dataclasses.field(default_factory=list)
+
+    @property
+    def clouds(self) -> int:
+        return len(self.seconds)
+
+    @property
+    def milliseconds(self) -> float:
+        """Median time per cloud."""
+        return 1e3 * statistics.median(self.seconds)
+
+
+def evaluate_detect(task: DetectTask, as_json: bool) -> None:
+    """Detect in every cloud and print how well it went; progress goes to standard error."""
+    from cobevglue.evaluation.detection import evaluate_detections
+
+    counts = _Counts()
+    with expected_errors():
+        detector = _load_detector(task.weights)
+        evaluation_range = _evaluation_range(task, detector)
+        report = evaluate_detections(
+            _detected(task, _clouds(task), detector, evaluation_range, counts),
+            evaluation_range=evaluation_range,
+            min_points=task.min_points,
+            score_threshold=_SCORE_THRESHOLD,
+        )
+    if not counts.clouds:
+        raise InputError(
+            f"{task.root}: {task.data} has no clouds, only the labels of {counts.without_cloud} frames of agents"
+        )
+    if as_json:
+        about = {"dataset": task.dataset, "split": task.split, "scenario": task.scenario, "weights": task.weights}
+        measured = {"without_cloud": counts.without_cloud, "median_milliseconds": counts.milliseconds}
+        print_json({**about, **measured, **dataclasses.asdict(report)})
+    else:
+        _print_report(task, report, counts)
+
+
+def _load_detector(weights: str) -> PointPillars:
+    try:
+        from cobevglue.perception import PointPillars
+    except ImportError as error:
+        raise InputError(str(error)) from error
+    import torch
+
+    is_file = weights.endswith(".safetensors")
+    detector = PointPillars.load(weights) if is_file else PointPillars.pretrained(weights)
+    return detector.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _evaluation_range(task: DetectTask, detector: PointPillars) -> EvaluationRange:
+    if task.reach is None:
+        return (*detector.config.x_range, *detector.config.y_range)
+    x, y = task.reach
+    return -x, x, -y, y
+
+
+def _clouds(task: DetectTask) -> Iterator[Cloud]:
+    """The clouds of the data set, or simulated ones."""
+    from cobevglue.datasets import DATASETS
+    from cobevglue.evaluation.detection_data import dataset_clouds, simulated_clouds
+
+    if task.dataset == SIMULATED:
+        if task.root is not None or task.scenario is not None:
+            raise InputError("--dataset simulated has neither --root nor --scenario: its clouds are made on the way")
+        try:
+            from cobevglue.simulation.episodes import SimulatedEpisodes
+        except ImportError as error:
+            raise InputError(str(error)) from error
+        return simulated_clouds(SimulatedEpisodes(task.split, task.seed), task.frames or _SIMULATED_CLOUDS)
+    if task.root is None:
+        raise InputError(f"--dataset {task.dataset} needs --root, the folder of the data set")
+    return dataset_clouds(DATASETS[task.dataset](task.root, task.split), task.scenario)
+
+
+def _detected(
+    task: DetectTask,
+    clouds: Iterable[Cloud],
+    detector: PointPillars,
+    evaluation_range: EvaluationRange,
+    counts: _Counts,
+) -> Iterator[DetectionFrame]:
+    """What was found in each cloud; writes pictures and failures on the way, and counts."""
+    from cobevglue.evaluation.detection_data import detect
+
+    noted = time.perf_counter()
+    with ExitStack() as files:
+        failures = _FailureFile(task, evaluation_range, files)
+        for cloud in clouds:
+            if cloud.points is None:
+                counts.without_cloud += 1
+                continue
+            start = time.perf_counter()
+            frame = detect(cloud, detector)
+            seconds = time.perf_counter() - start
+            failures.write(frame)
+            if task.pictures is not None and counts.clouds % _PICTURE_EVERY == 0:
+                _write_picture(task.pictures, counts.clouds, frame, cloud, evaluation_range, task.min_points)
+            counts.seconds.append(seconds)
+            yield frame
+            if time.perf_counter() - noted > _NOTE_EVERY:
+                print_note(f"{counts.clouds} clouds, at {cloud.frame} {cloud.agent}")
+                noted = time.perf_counter()
+            if counts.clouds == task.frames:
+                return
+
+
+class _FailureFile:
+    """The CSV file of failures, made when there is the first frame; does nothing where none is wanted."""
+
+    def __init__(self, task: DetectTask, evaluation_range: EvaluationRange, files: ExitStack) -> None:
+        self._path, self._range, self._min_points, self._files = task.failures, evaluation_range, task.min_points, files
+        self._table: csv.DictWriter[str] | None = None
+
+    def write(self, frame: DetectionFrame) -> None:
+        from cobevglue.evaluation.detection_matching import Failure, find_failures
+
+        if self._path is None:
+            return
+        if self._table is None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            file = self._files.enter_context(self._path.open("w", newline="", encoding="utf-8"))
+            self._table = csv.DictWriter(file, [field.name for field in dataclasses.fields(Failure)])
+            self._table.writeheader()
+        failures = find_failures(
+            frame,
+            score_threshold=_SCORE_THRESHOLD,
+            evaluation_range=self._range,
+            min_points=self._min_points,
+        )
+        for failure in failures:
+            row = dataclasses.asdict(failure)
+            self._table.writerow({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()})
+
+
+def _write_picture(
+    folder: Path, number: int, frame: DetectionFrame, cloud: Cloud, evaluation_range: EvaluationRange, min_points: int
+) -> None:
+    from cobevglue.visualization import draw_detections, save_figure
+
+    assert cloud.points is not None
+    figure = draw_detections(
+        frame,
+        cloud.points,
+        score_threshold=_SCORE_THRESHOLD,
+        evaluation_range=evaluation_range,
+        min_points=min_points,
+    )
+    save_figure(figure, folder / f"{number:06d}.png")
+
+
+def _print_report(task: DetectTask, report: DetectionReport, counts: _Counts) -> None:
+    """Tables: average precision by distance, errors of the boxes found, and recall by label."""
+    thresholds = list(report.overall.at)
+    groups = {"all": report.overall, **report.by_range}
+    print_table(
+        f"PointPillars {Path(task.weights).stem} on {task.data}: {report.frames} clouds, {_limits(report)}",
+        (
+            "distance",
+            "objects",
+            *(f"AP@{t:g}" for t in thresholds),
+            *(f"frame order @{t:g}" for t in thresholds),
+            "recall",
+            "precision",
+        ),
+        [_score_row(name, group) for name, group in groups.items() if name == "all" or _has_any(group)],
+    )
+    sure = f"IoU 0.5, score >= {report.score_threshold:g}"
+    if report.errors.count:
+        _print_errors(report.errors, sure)
+    if len(report.labels) > 1:
+        print_table(
+            f"Objects found by label ({sure})",
+            ("label", "objects", "recall"),
+            [(name, str(one.truth), _percent(one.recall)) for name, one in report.labels.items()],
+        )
+    print("AP sorts all detections by score; frame order is the dialect of OpenCOOD's released code.")
+    print(f"Recall and precision: {sure}. {report.ignored_truth} objects were ignored.")
+    none = f" {counts.without_cloud} frames of agents have no cloud." if counts.without_cloud else ""
+    print(f"{counts.milliseconds:.0f} ms per cloud (median).{none}")
+
+
+def _print_errors(errors: BoxErrors, sure: str) -> None:
+    rows = [
+        ("heading off by more than 90 degrees", _percent(errors.flipped)),
+        ("distance of centres", f"{errors.distance:.2f} m"),
+        ("  nine in ten are below", f"{errors.distance_90:.2f} m"),
+        ("forward, left (-: too far back, right)", f"{errors.longitudinal:+.2f} m, {errors.lateral:+.2f} m"),
+        ("away from the sensor, up", f"{errors.radial:+.2f} m, {errors.vertical:+.2f} m"),
+        ("yaw, flips apart", f"{math.degrees(errors.yaw):.1f} degrees"),
+        ("length, width, height", ", ".join(f"{v:+.2f} m" for v in (errors.length, errors.width, errors.height))),
+    ]
+    print_table(f"Median errors of the {errors.count} objects found ({sure})", ("", ""), rows)
+
+
+def _limits(report: DetectionReport) -> str:
+    """Which objects count, in words."""
+    assert report.evaluation_range is not None
+    x_min, x_max, y_min, y_max = report.evaluation_range
+    bounds = [
+        f"|{axis}| <= {high:g} m" if low == -high else f"{axis} {low:g} to {high:g} m"
+        for axis, low, high in (("x", x_min, x_max), ("y", y_min, y_max))
+    ]
+    points = [f">= {report.min_points} points"] if report.min_points else []
+    return ", ".join([*bounds, *points])
+
+
+def _has_any(group: GroupScore) -> bool:
+    return group.truth > 0 or any(score.detections for score in group.at.values())
+
+
+def _score_row(name: str, group: GroupScore) -> tuple[str, ...]:
+    scores = group.at.values()
+    at = group.at[0.5]
+    aps = [_percent(score.ap[dialect]) for dialect in ("global", "frame-order") for score in scores]
+    return (name, str(group.truth), *aps, _percent(at.recall), _percent(at.precision))
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.1f} %"

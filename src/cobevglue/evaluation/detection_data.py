@@ -1,0 +1,106 @@
+"""Clouds with their truth, to measure a detector on: every agent's own cloud of a data set, or simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets import Dataset
+from cobevglue.evaluation.detection_matching import DetectionFrame
+from cobevglue.training.samples import count_points
+from cobevglue.typing import Float32Array, IntArray
+
+__all__ = ["Cloud", "Detector", "Episodes", "LabelledCloud", "dataset_clouds", "detect", "simulated_clouds"]
+
+
+class Detector(Protocol):
+    """What finds boxes in a cloud, such as `PointPillars`."""
+
+    def detect(self, points: Float32Array, /) -> Boxes:
+        """Boxes with scores in the frame of the points (N, 4)."""
+        ...
+
+
+class LabelledCloud(Protocol):
+    """One cloud (N, 4), the K objects in it in the sensor's frame, and the (K,) points on each."""
+
+    @property
+    def points(self) -> Float32Array: ...  # noqa: D102
+    @property
+    def boxes(self) -> Boxes: ...  # noqa: D102
+    @property
+    def point_count(self) -> IntArray: ...  # noqa: D102
+
+
+class Episodes(Protocol):
+    """A source of clouds without end, such as `SimulatedEpisodes`."""
+
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
+        """The clouds of episode `index`, from 0."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cloud:
+    """One agent's cloud at one time, and the objects that this agent could see, in its LiDAR frame.
+
+    Attributes:
+        frame: name of the frame, with that of its scenario.
+        agent: name of the agent.
+        points: (N, 4) x, y, z [m], intensity; None where no cloud is stored.
+        truth: K boxes; none where there is no cloud.
+        point_count: (K,) points in each of them.
+    """
+
+    frame: str
+    agent: str
+    points: Float32Array | None
+    truth: Boxes
+    point_count: IntArray
+
+
+def dataset_clouds(dataset: Dataset, scenario: str | None = None) -> Iterator[Cloud]:
+    """Every agent of every frame, in order, with its own labels; also those without a cloud, to be counted.
+
+    Args:
+        dataset: a split of a data set.
+        scenario: name of the only one to go through.
+
+    Raises:
+        ValueError: no such scenario, or a broken file; names it.
+    """
+    for drive in dataset if scenario is None else [dataset[scenario]]:
+        for frame in drive:
+            for name, agent in frame.agents.items():
+                points, where = agent.points, f"{frame.scenario}/{frame.timestamp}"
+                if points is None:
+                    yield Cloud(where, name, None, Boxes.empty(), np.zeros(0, dtype=np.int64))
+                else:
+                    yield Cloud(where, name, points, agent.objects, count_points(points, agent.objects))
+
+
+def simulated_clouds(source: Episodes, count: int) -> Iterator[Cloud]:
+    """The first `count` clouds of simulated episodes."""
+    made, index = 0, 0
+    while made < count:
+        for number, sample in enumerate(source.episode(index)[: count - made]):
+            yield Cloud(f"episode {index}", f"sample {number}", sample.points, sample.boxes, sample.point_count)
+            made += 1
+        index += 1
+
+
+def detect(cloud: Cloud, detector: Detector) -> DetectionFrame:
+    """What the detector finds in a cloud, next to the truth.
+
+    Raises:
+        ValueError: the frame has no cloud.
+    """
+    if cloud.points is None:
+        raise ValueError(f"{cloud.frame}: {cloud.agent}: no cloud is stored")
+    found = detector.detect(cloud.points)
+    counts = count_points(cloud.points, found)
+    return DetectionFrame(found, cloud.truth, cloud.point_count, cloud.frame, cloud.agent, counts)
