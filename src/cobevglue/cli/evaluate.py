@@ -46,7 +46,9 @@ def evaluate(
     dataset: Annotated[Dataset, typer.Option(help="Format of the data set.")] = Dataset.OPV2V,
     split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
     seed: Annotated[int, typer.Option(min=0, help="Of the detection errors, or of simulated worlds.")] = 0,
-    max_range: Annotated[float, typer.Option(min=1.0, help="align: objects farther away are not detected [m].")] = 70.0,
+    max_range: Annotated[
+        float, typer.Option(min=1.0, help="align: objects farther away are not detected, in metres.")
+    ] = 70.0,
     perfect: Annotated[
         bool, typer.Option("--perfect", help="align: labels as they are, without a detector's errors.")
     ] = False,
@@ -57,7 +59,7 @@ def evaluate(
     reach: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--range", help="detect: objects count up to this |x| and |y| [m]; else as far as the model looks."
+            "--range", help="detect: objects count up to this |x| and |y|, in metres; else as far as the model looks."
         ),
     ] = None,
     min_points: Annotated[int, typer.Option(min=0, help="detect: objects with fewer points are ignored.")] = 0,
