@@ -1,0 +1,206 @@
+"""Settings of a training run; the shipped ones by name, and a YAML file or single values that override them."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import Field, ValidationError, field_validator
+
+from cobevglue.datasets import DATASETS
+from cobevglue.datasets.frame import did_you_mean
+from cobevglue.perception import CONFIGS, PointPillarsConfig
+from cobevglue.settings import Settings
+from cobevglue.training.augmentation import AugmentationConfig
+from cobevglue.training.optimisation import OptimisationConfig
+
+__all__ = ["PRESETS", "DataConfig", "TrainDetectorConfig", "ValidationConfig", "load_config"]
+
+SIMULATED = "simulated"
+"""Name of the data that are made while training."""
+
+_Count = Annotated[int, Field(ge=1)]
+
+
+class DataConfig(Settings):
+    """Where samples come from.
+
+    Attributes:
+        source: "simulated", or the name of a data set in `DATASETS`.
+        root: folder of the data set.
+        split: what to train on.
+        validation_split: what to validate on.
+        options: further settings of the source: those of `EpisodeSettings`, or arguments of `DatasetEpisodes`.
+        worlds: simulated worlds to train on, over and over; None for a new one each time.
+        min_points: objects with fewer points are neither to be found nor wrong to find.
+        pool: episodes whose samples are shuffled together, in each worker.
+        workers: processes that make samples, for each training process; 0 makes them in the training process. Another
+            number makes another order of samples.
+    """
+
+    source: str = SIMULATED
+    root: Path | None = None
+    split: str = "train"
+    validation_split: str = "validation"
+    options: dict[str, Any] = Field(default_factory=dict)
+    worlds: _Count | None = None
+    min_points: Annotated[int, Field(ge=0)] = 5
+    pool: _Count = 4
+    workers: Annotated[int, Field(ge=0)] = 1
+
+    @field_validator("source")
+    @classmethod
+    def _known_source(cls, source: str) -> str:
+        if source not in (SIMULATED, *DATASETS):
+            raise ValueError(f"no data {did_you_mean(source, (SIMULATED, *DATASETS))}")
+        return source
+
+
+class ValidationConfig(Settings):
+    """How the model is measured while it is trained.
+
+    Attributes:
+        every: epochs between validations; the last epoch is always validated.
+        episodes: the first episodes of the validation split; they stay in memory. 0 for no validation.
+        score: "ap_0.5" or "ap_0.7", by which the best model is chosen.
+    """
+
+    every: _Count = 1
+    episodes: Annotated[int, Field(ge=0)] = 16
+    score: Literal["ap_0.5", "ap_0.7"] = "ap_0.7"
+
+
+class TrainDetectorConfig(Settings):
+    """Settings of `train_detector`.
+
+    Attributes:
+        model: of the detector; a name in `CONFIGS` is taken, too.
+        data: what to train on.
+        augmentation: how samples are changed.
+        optimisation: how weights are found.
+        validation: how they are measured.
+        seed: of the first weights, the order of samples and their changes.
+        init_from: weights to start from, a file of an earlier run; the schedule starts anew.
+        device: "auto" takes CUDA where there is one.
+        threads: of torch on the CPU, in each training process; workers have one each.
+        report_every: time between lines of progress [s].
+    """
+
+    model: PointPillarsConfig = CONFIGS["compact"]
+    data: DataConfig = DataConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
+    optimisation: OptimisationConfig = OptimisationConfig()
+    validation: ValidationConfig = ValidationConfig()
+    seed: Annotated[int, Field(ge=0)] = 0
+    init_from: Path | None = None
+    device: str = "auto"
+    threads: _Count = 2
+    report_every: Annotated[float, Field(gt=0.0)] = 20.0
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _model_by_name(cls, model: Any) -> Any:
+        if not isinstance(model, str):
+            return model
+        if model not in CONFIGS:
+            raise ValueError(f"no model {did_you_mean(model, CONFIGS)}")
+        return CONFIGS[model]
+
+
+FREE_TO_CHANGE = {"device", "threads", "report_every", "init_from"}
+"""A run may be resumed with other values of these."""
+
+PRESETS: dict[str, TrainDetectorConfig] = {
+    "compact": TrainDetectorConfig(),
+    # Its range is long and narrow: turned by more than this, most of a scene would leave it.
+    "opv2v": TrainDetectorConfig(
+        model=CONFIGS["opv2v"],
+        augmentation=AugmentationConfig(rotation=math.pi / 4),
+        optimisation=OptimisationConfig(epochs=60, samples_per_epoch=6000),
+    ),
+    # Seconds, to see that everything works; it finds nothing.
+    "tiny": TrainDetectorConfig(
+        optimisation=OptimisationConfig(epochs=2, samples_per_epoch=8, batch_size=2),
+        data=DataConfig(worlds=1, pool=1, workers=0),
+        validation=ValidationConfig(episodes=1),
+        report_every=1.0,
+    ),
+}
+"""Shipped settings by name."""
+
+
+def load_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainDetectorConfig:
+    """Settings by the name of a preset or from a YAML file, with single values changed.
+
+    Args:
+        name_or_file: a name in `PRESETS`, or a `.yaml` file with what differs from the default, or from the preset that
+            its key `preset` names.
+        changes: "key=value", with dots into nested settings and the value in YAML: "optimisation.epochs=3".
+
+    Raises:
+        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
+        FileNotFoundError: there is no such file.
+    """
+    overrides: dict[str, Any] = {}
+    preset, where = name_or_file, ""
+    if name_or_file.endswith((".yaml", ".yml")):
+        overrides = _read_yaml(Path(name_or_file))
+        preset, where = str(overrides.pop("preset", "compact")), f"{name_or_file}: "
+    if preset not in PRESETS:
+        raise ValueError(f"{where}no preset {did_you_mean(preset, PRESETS)}")
+    values = _merged(PRESETS[preset].model_dump(), overrides)
+    for change in changes:
+        values = _merged(values, _one_change(change))
+    try:
+        return TrainDetectorConfig.model_validate(values)
+    except ValidationError as error:
+        raise ValueError(where + _first_problem(error)) from None
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} is not there")
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file}: not readable as YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict | None):
+        raise ValueError(f"{file}: must be a mapping of settings, got {type(content).__name__}")
+    return content or {}
+
+
+def _one_change(change: str) -> dict[str, Any]:
+    key, equals, text = change.partition("=")
+    if not equals or not key:
+        raise ValueError(f"{change!r} must be key=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ValueError(f"{change!r}: the value is not readable as YAML") from None
+    if isinstance(value, str):  # YAML 1.1 takes 1e-3 for text
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return dict(value)
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with `changes` put in, mapping by mapping; neither is changed."""
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    where = ".".join(str(part) for part in problem["loc"])
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{where}: {message}" if where else message

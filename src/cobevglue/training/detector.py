@@ -1,0 +1,362 @@
+"""The training of a detector: `train_detector`."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.data import DataLoader
+
+from cobevglue.perception import DetectionLoss, PointPillars
+from cobevglue.training.batches import Batch, Batches
+from cobevglue.training.checkpoint import (
+    RunState,
+    differing_keys,
+    load_state,
+    provenance,
+    save_state,
+)
+from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
+from cobevglue.training.optimisation import MeanWeights, learning_rate, make_optimizer
+from cobevglue.training.processes import Processes, process_group
+from cobevglue.training.run_log import RunLog, print_progress
+from cobevglue.training.samples import EpisodeSource
+from cobevglue.training.sources import make_source
+from cobevglue.training.stream import EpisodeStream
+from cobevglue.training.validation import Validation
+
+__all__ = ["DivergedError", "TrainingResult", "train_detector"]
+
+STATE, LAST, BEST = "state.pt", "last.safetensors", "best.safetensors"
+
+
+class DivergedError(RuntimeError):
+    """The loss is no number any more."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    Attributes:
+        folder: with `last.safetensors`, `best.safetensors` (of the best validation), `state.pt`, `log.jsonl` and
+            TensorBoard's event files.
+        epochs: done so far.
+        finished: all epochs are done; otherwise the time was up, and the run can be resumed.
+        metrics: of the last validation; empty without any.
+        best: the best validation score; None without any.
+    """
+
+    folder: Path
+    epochs: int
+    finished: bool
+    metrics: dict[str, float]
+    best: float | None
+
+
+def train_detector(
+    config: TrainDetectorConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    max_minutes: float | None = None,
+    source: EpisodeSource | None = None,
+    validation_source: EpisodeSource | None = None,
+    report: Callable[[str], None] = print_progress,
+) -> TrainingResult:
+    """Train a detector, or go on with a run that was interrupted.
+
+    State is saved after each epoch. A resumed run continues exactly as the uninterrupted one would have, on the same
+    machine and with the same number of threads. Under `torchrun` all processes train together, each with batches of its
+    own.
+
+    Args:
+        config: settings.
+        folder: of the run; made where missing.
+        resume: go on with the run in `folder`.
+        max_minutes: stop after the last epoch that is done in this time, as far as one can tell from the one before. A
+            first epoch is always done.
+        source: what to train on, in the place of `config.data`'s.
+        validation_source: what to validate on, likewise.
+        report: takes lines of progress.
+
+    Raises:
+        ValueError: the folder has a run already, or one with other settings; a device that is not there; a broken file.
+        FileNotFoundError: nothing to resume, or no such data or weights.
+        DivergedError: the loss is not finite any more.
+    """
+    source = source or make_source(config.data, config.seed, validation=False)
+    if config.validation.episodes and validation_source is None:
+        validation_source = make_source(config.data, config.seed, validation=True)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.threads)
+    try:
+        with process_group(config.device) as processes:
+            run = _Run(config, folder, processes, resume, report if processes.is_first else lambda _: None)
+            return run.train(source, validation_source, max_minutes)
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Run:
+    """The state of a run in one process."""
+
+    def __init__(
+        self,
+        config: TrainDetectorConfig,
+        folder: Path,
+        processes: Processes,
+        resume: bool,
+        report: Callable[[str], None],
+    ) -> None:
+        self.config, self.folder, self.processes, self.report = config, folder, processes, report
+        optimisation = config.optimisation
+        self.batches_per_epoch = optimisation.samples_per_epoch // (optimisation.batch_size * processes.count)
+        if self.batches_per_epoch == 0:
+            raise ValueError(
+                f"optimisation.samples_per_epoch: {optimisation.samples_per_epoch} samples are no full batch of "
+                f"{optimisation.batch_size} for each of {processes.count} processes"
+            )
+        self.steps = optimisation.epochs * self.batches_per_epoch
+
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.model = PointPillars(config.model)  # its convolutions are channels-last
+        self.model.to(processes.device)
+        self.loss = DetectionLoss(config.model)
+        self.epoch, self.elapsed = 0, 0.0
+        self.best: float | None = None
+        state = None
+        if resume:
+            state = load_state(folder / STATE, processes.device)
+            self._refuse_other_settings(state)
+            self.model.load_state_dict(state.model)
+        else:
+            if (folder / STATE).exists():
+                raise ValueError(f"{folder}: has a run already; resume it, or choose another folder")
+            if config.init_from is not None:
+                _start_from(self.model, config.init_from)
+        self.mean = MeanWeights(self.model, optimisation.mean_decay)
+        self.optimizer = make_optimizer(self.model, optimisation)
+        if state is not None:
+            self.mean.model.load_state_dict(state.mean_model)
+            self.optimizer.load_state_dict(state.optimizer)
+            self.epoch, self.elapsed, self.best = state.epoch, state.elapsed, state.best
+        self.net = self._distributed()
+
+    def train(
+        self, source: EpisodeSource, validation_source: EpisodeSource | None, max_minutes: float | None
+    ) -> TrainingResult:
+        """All epochs that are left, or as many as there is time for."""
+        config, processes = self.config, self.processes
+        validation = None
+        if validation_source is not None and config.validation.episodes:
+            validation = Validation(config, validation_source, processes, self.loss)
+        if processes.is_first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        metrics: dict[str, float] = {}
+        started, longest = time.monotonic(), 0.0
+        with RunLog(self.folder, self.epoch * self.batches_per_epoch, write=processes.is_first) as log:
+            batches = self._batches(source)
+            while self.epoch < config.optimisation.epochs:
+                epoch_started = time.monotonic()
+                self._train_epoch(batches, log)
+                self.epoch += 1
+                if validation is not None and (
+                    self.epoch % config.validation.every == 0 or self.epoch == config.optimisation.epochs
+                ):
+                    metrics = self._validate(validation, log)
+                epoch_time = time.monotonic() - epoch_started
+                self.elapsed, longest = self.elapsed + epoch_time, max(longest, epoch_time)
+                self._save(metrics)
+                expected = (time.monotonic() - started + longest) / 60.0
+                if processes.share(max_minutes is not None and expected > max_minutes):
+                    break
+        finished = self.epoch == config.optimisation.epochs
+        if not finished:
+            self.report(f"time is up after epoch {self.epoch} of {config.optimisation.epochs}; resume to go on")
+        return TrainingResult(self.folder, self.epoch, finished, metrics, self.best)
+
+    def _batches(self, source: EpisodeSource) -> Iterator[Batch]:
+        """Of all epochs that are left, so that workers are ahead while this process validates or saves."""
+        config, optimisation = self.config, self.config.optimisation
+        ready = Batches(config.model, config.data.min_points, config.augmentation)
+        stream = EpisodeStream(
+            source,
+            ready.prepare,
+            epochs=range(self.epoch, optimisation.epochs),
+            batches_per_epoch=self.batches_per_epoch,
+            batch_size=optimisation.batch_size,
+            seed=config.seed,
+            pool=config.data.pool,
+            rank=self.processes.rank,
+            processes=self.processes.count,
+        )
+        workers = config.data.workers
+        return iter(
+            DataLoader(
+                stream,
+                batch_size=optimisation.batch_size,
+                num_workers=workers,
+                collate_fn=ready.collate,
+                prefetch_factor=4 if workers else None,
+                pin_memory=self.processes.device.type == "cuda",
+            )
+        )
+
+    def _train_epoch(self, batches: Iterator[Batch], log: RunLog) -> None:
+        config, optimisation, device = self.config, self.config.optimisation, self.processes.device
+        self.net.train()
+        epoch, interval = _Meter(), _Meter()
+        first = self.epoch * self.batches_per_epoch
+        for step in range(first, first + self.batches_per_epoch):
+            asked = time.monotonic()
+            batch = next(batches)
+            waited = time.monotonic() - asked
+            rate = learning_rate(step, self.steps, optimisation)
+            for group in self.optimizer.param_groups:
+                group["lr"] = rate
+            with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+                output = self.net(batch.clouds(device))
+            terms = self.loss(output, batch.targets.to(device))
+            self.optimizer.zero_grad(set_to_none=True)
+            terms.total.backward()  # type: ignore[no-untyped-call]
+            norm = nn.utils.clip_grad_norm_(self.model.parameters(), optimisation.clip)
+            self.optimizer.step()
+            self.mean.update(self.model, step)
+            values = {**{name: term.detach() for name, term in terms._asdict().items()}, "gradient": norm.detach()}
+            for meter in (epoch, interval):
+                meter.add(values, optimisation.batch_size * self.processes.count, waited)
+            if interval.seconds >= config.report_every:
+                numbers = self._numbers(interval, step, rate)
+                log.add("train", step + 1, self.epoch, numbers)
+                self.report(self._progress(step + 1, numbers))
+                interval = _Meter()
+        numbers = self._numbers(epoch, step, rate)
+        log.add("epoch", step + 1, self.epoch, numbers)
+        self.report(self._progress(step + 1, numbers))
+
+    def _numbers(self, meter: _Meter, step: int, rate: float) -> dict[str, float]:
+        numbers = meter.means()
+        if not math.isfinite(numbers["total"]):
+            raise DivergedError(
+                f"the loss is {numbers['total']} at step {step + 1}; the state of epoch {self.epoch} is kept. Lower "
+                f"optimisation.learning_rate or optimisation.clip"
+            )
+        return {**numbers, "learning_rate": rate}
+
+    def _progress(self, step: int, numbers: dict[str, float]) -> str:
+        hidden = ("learning_rate", "samples_per_second", "waiting")
+        terms = " ".join(f"{name} {value:.3f}" for name, value in numbers.items() if name not in hidden)
+        samples = (self.steps - step) * self.config.optimisation.batch_size * self.processes.count
+        return (
+            f"epoch {self.epoch + 1}/{self.config.optimisation.epochs} step {step}/{self.steps}: {terms}, "
+            f"lr {numbers['learning_rate']:.1e}, {numbers['samples_per_second']:.1f} samples/s "
+            f"({100 * numbers['waiting']:.0f} % waiting for data), "
+            f"{_duration(samples / numbers['samples_per_second'])} left"
+        )
+
+    def _validate(self, validation: Validation, log: RunLog) -> dict[str, float]:
+        """The numbers of the mean weights, the same in all processes; the best model so far is saved."""
+        started = time.monotonic()
+        metrics: dict[str, float] = self.processes.share(validation.measure(self.mean.model))
+        log.add("validation", self.epoch * self.batches_per_epoch, self.epoch, metrics)
+        listed = " ".join(f"{name} {value:.3f}" for name, value in metrics.items())
+        self.report(f"epoch {self.epoch} validated in {time.monotonic() - started:.0f} s: {listed}")
+        score = metrics[self.config.validation.score]
+        if math.isfinite(score) and (self.best is None or score > self.best):
+            self.best = score
+            self._save_model(BEST, metrics)
+        return metrics
+
+    def _save(self, metrics: dict[str, float]) -> None:
+        if not self.processes.is_first:
+            return
+        self._save_model(LAST, metrics)
+        state = RunState(
+            config=self.config.model_dump(mode="json"),
+            processes=self.processes.count,
+            epoch=self.epoch,
+            elapsed=self.elapsed,
+            best=self.best,
+            model=self.model.state_dict(),
+            mean_model=self.mean.model.state_dict(),
+            optimizer=self.optimizer.state_dict(),
+        )
+        save_state(self.folder / STATE, state)
+
+    def _save_model(self, name: str, metrics: dict[str, float]) -> None:
+        if not self.processes.is_first:
+            return
+        metadata = {
+            **provenance(),
+            "training": self.config.model_dump(mode="json"),
+            "epoch": self.epoch,
+            "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
+        }
+        self.mean.model.save(self.folder / name, metadata)
+
+    def _refuse_other_settings(self, state: RunState) -> None:
+        ours = self.config.model_dump(mode="json")
+        differing = [key for key in differing_keys(state.config, ours) if key not in FREE_TO_CHANGE]
+        if state.processes != self.processes.count:
+            differing.append(f"number of processes ({state.processes} before, now {self.processes.count})")
+        if differing:
+            raise ValueError(f"{self.folder}: the run was started with other settings: {', '.join(differing)}")
+
+    def _distributed(self) -> nn.Module:
+        if self.processes.count == 1:
+            return self.model
+        cuda = self.processes.device.type == "cuda"
+        # The layers are replaced within the model, with the same parameters: optimiser and checkpoints do not notice.
+        model: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(self.model) if cuda else self.model  # type: ignore[no-untyped-call]
+        return DistributedDataParallel(model, device_ids=[self.processes.device] if cuda else None)
+
+
+@dataclass
+class _Meter:
+    """Means over steps. Sums stay on the device: asking a GPU for a number makes it wait."""
+
+    started: float = field(default_factory=time.monotonic)
+    sums: dict[str, torch.Tensor] = field(default_factory=dict)
+    steps: int = 0
+    samples: int = 0
+    waited: float = 0.0
+
+    def add(self, values: dict[str, torch.Tensor], samples: int, waited: float) -> None:
+        for name, value in values.items():
+            self.sums[name] = self.sums[name] + value if name in self.sums else value
+        self.steps, self.samples, self.waited = self.steps + 1, self.samples + samples, self.waited + waited
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.started
+
+    def means(self) -> dict[str, float]:
+        seconds = max(self.seconds, 1e-9)
+        terms = {name: float(value) / self.steps for name, value in self.sums.items()}
+        return {**terms, "samples_per_second": self.samples / seconds, "waiting": self.waited / seconds}
+
+
+def _start_from(model: PointPillars, path: Path) -> None:
+    """Weights of an earlier run; other ranges and thresholds are fine, another network is not."""
+    theirs, ours = PointPillars.load(path).state_dict(), model.state_dict()
+    wrong = [
+        name
+        for name in {**ours, **theirs}
+        if name not in ours or name not in theirs or ours[name].shape != theirs[name].shape
+    ]
+    if wrong:
+        raise ValueError(f"{path}: weights of another network; {len(wrong)} differ, the first is {wrong[0]}")
+    model.load_state_dict(theirs)
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"

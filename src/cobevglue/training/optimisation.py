@@ -1,0 +1,95 @@
+"""The optimiser's settings, the learning rate over the steps, and the running mean of the weights."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Annotated, Generic, TypeVar
+
+import torch
+from pydantic import Field
+from torch import nn
+
+from cobevglue.settings import Settings
+
+__all__ = ["MeanWeights", "OptimisationConfig", "learning_rate", "make_optimizer"]
+
+Model = TypeVar("Model", bound=nn.Module)
+
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
+class OptimisationConfig(Settings):
+    """How weights are found: AdamW, one cycle of the learning rate over all steps.
+
+    Attributes:
+        epochs: how many.
+        samples_per_epoch: of all processes together, rounded down to full batches.
+        batch_size: samples in a step, of each process.
+        learning_rate: the highest.
+        start: share of it at the first step ...
+        warm_up: ... growing to the highest over this share of all steps ...
+        end: ... and falling to this share of it until the last step; both as half a cosine.
+        weight_decay: of the weights with more than one dimension: not of biases and norms.
+        clip: largest norm of the gradient; a longer one is shortened.
+        mean_decay: the model that is validated and saved is a running mean of the weights that forgets them by this
+            factor a step (faster in the first steps); 0 takes the last weights.
+    """
+
+    epochs: Annotated[int, Field(ge=1)] = 40
+    samples_per_epoch: Annotated[int, Field(ge=1)] = 4000
+    batch_size: Annotated[int, Field(ge=1)] = 4
+    learning_rate: _Positive = 2e-3
+    start: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+    warm_up: _Share = 0.1
+    end: Annotated[float, Field(ge=0.0, le=1.0)] = 1e-3
+    weight_decay: Annotated[float, Field(ge=0.0)] = 0.01
+    clip: _Positive = 10.0
+    mean_decay: _Share = 0.999
+
+
+def learning_rate(step: int, steps: int, config: OptimisationConfig) -> float:
+    """Of step `step` of `steps`: a function of nothing else, so that a resumed run needs no memory of it."""
+    rising = config.warm_up * steps
+    if step < rising:
+        return config.learning_rate * _half_cosine(config.start, 1.0, step / rising)
+    return config.learning_rate * _half_cosine(1.0, config.end, (step - rising) / max(steps - 1 - rising, 1.0))
+
+
+def _half_cosine(first: float, last: float, share: float) -> float:
+    return last + (first - last) * (1.0 + math.cos(math.pi * min(share, 1.0))) / 2.0
+
+
+def make_optimizer(model: nn.Module, config: OptimisationConfig) -> torch.optim.AdamW:
+    """AdamW over the parameters, weight decay on those it is meant for."""
+    parameters = [p for p in model.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in parameters if p.ndim > 1], "weight_decay": config.weight_decay},
+        {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99))
+
+
+class MeanWeights(Generic[Model]):
+    """A copy of a model whose weights follow it as an exponential running mean; norms' statistics, too.
+
+    Attributes:
+        model: the copy, in evaluation mode.
+    """
+
+    def __init__(self, model: Model, decay: float) -> None:
+        """Start from the weights as they are."""
+        self.model = copy.deepcopy(model)
+        self.model.eval().requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, model: nn.Module, step: int) -> None:
+        """Take in the weights after step `step` (from 0)."""
+        decay = min(self._decay, (1.0 + step) / (10.0 + step))
+        ours, theirs = self.model.state_dict(), model.state_dict()
+        floating = [name for name, value in ours.items() if value.is_floating_point()]
+        torch._foreach_lerp_([ours[n] for n in floating], [theirs[n] for n in floating], 1.0 - decay)
+        for name in ours.keys() - set(floating):
+            ours[name].copy_(theirs[name])

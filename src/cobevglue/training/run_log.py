@@ -1,0 +1,64 @@
+"""What a run says about itself: lines for people, `log.jsonl` for programs, event files for TensorBoard."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+__all__ = ["RunLog", "print_progress"]
+
+
+def print_progress(text: str) -> None:
+    """A line to standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+class RunLog:
+    """Files of one run, added to when it is resumed. Without TensorBoard there is `log.jsonl` alone."""
+
+    def __init__(self, folder: Path, from_step: int = 0, write: bool = True) -> None:
+        """Open the files.
+
+        Args:
+            folder: of the run.
+            from_step: where a resumed run goes on; TensorBoard then forgets what an earlier try logged beyond.
+            write: False for a log of nothing: one process writes for all.
+        """
+        self._lines = (folder / "log.jsonl").open("a", encoding="utf-8") if write else None
+        self._events: Any = None
+        if not write:
+            return
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        self._events = SummaryWriter(str(folder), purge_step=from_step or None)
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._lines is not None:
+            self._lines.close()
+        if self._events is not None:
+            self._events.close()
+
+    def add(self, group: str, step: int, epoch: int, values: Mapping[str, float]) -> None:
+        """Log numbers after `step` steps: a line in `log.jsonl`, a curve "group/name" each in TensorBoard."""
+        if self._lines is None:
+            return
+        finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
+        entry = {"group": group, "step": step, "epoch": epoch, "time": round(time.time(), 3), **finite}
+        self._lines.write(json.dumps(entry) + "\n")
+        self._lines.flush()
+        if self._events is not None:
+            for name, value in values.items():
+                self._events.add_scalar(f"{group}/{name}", value, step)

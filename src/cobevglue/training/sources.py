@@ -1,0 +1,48 @@
+"""The source of samples that a configuration names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cobevglue.datasets import DATASETS
+from cobevglue.training.config import SIMULATED, DataConfig
+from cobevglue.training.samples import DatasetEpisodes, EpisodeSource, SampleLike
+
+__all__ = ["Repeated", "make_source"]
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """The first episodes of a source, over and over."""
+
+    source: EpisodeSource
+    episodes: int
+
+    def episode(self, index: int) -> Sequence[SampleLike]:
+        """Episode `index`, counted in a circle; see `EpisodeSource`."""
+        return self.source.episode(index % self.episodes)
+
+
+def make_source(config: DataConfig, seed: int, *, validation: bool) -> EpisodeSource:
+    """What to train or validate on.
+
+    Args:
+        config: names it.
+        seed: of the run. Validation has one of its own, so that runs can be compared.
+        validation: take the validation split.
+
+    Raises:
+        ValueError: no root, or no such split.
+        FileNotFoundError: the data set is not there.
+    """
+    split = config.validation_split if validation else config.split
+    seed = 0 if validation else seed
+    if config.source == SIMULATED:
+        from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
+
+        simulated = SimulatedEpisodes(split, seed, EpisodeSettings(**config.options))
+        return Repeated(simulated, config.worlds) if config.worlds is not None and not validation else simulated
+    if config.root is None:
+        raise ValueError(f"data.root: must be set for the data set {config.source}")
+    return DatasetEpisodes(DATASETS[config.source](config.root, split), seed, **config.options)
