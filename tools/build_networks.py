@@ -51,24 +51,24 @@ class Plan:
         lanes: int,
         speed: float,
         width: float,
-        pocket: float = 0.0,
-        **attributes: object,
+        split: float = 0.0,
+        pocket: bool = False,
+        priority: int = 5,
     ) -> None:
-        """A directed road; with a `pocket` its leftmost lane exists on the last so many metres only."""
+        """A directed road, perhaps of two edges: split so far before its end, or after its start if negative.
+
+        SUMO gives all lanes of one edge the same length. Where only a part of an edge bends, vehicles that change lanes
+        would therefore jump ahead or back; splitting it where the bend begins avoids that. With a `pocket` the leftmost
+        lane exists only after the split.
+        """
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
-        split = ""
-        if pocket:
-            through = " ".join(str(lane) for lane in range(lanes - 1))
-            all_lanes = " ".join(str(lane) for lane in range(lanes))
-            split = _element("split", pos=0, lanes=through) + _element("split", pos=-pocket, lanes=all_lanes)
-        text = _element(
-            "edge",
-            **{"id": name, "from": start, "to": end, "shape": points, "numLanes": lanes},
-            speed=f"{speed:.2f}",
-            width=f"{width:.2f}",
-            **attributes,
-        )
-        self.edges.append(text if not split else text[:-2] + ">" + split + "</edge>")
+        splits = ""
+        if split:
+            before, after = (" ".join(str(lane) for lane in range(lanes - closed)) for closed in (pocket, False))
+            splits = _element("split", pos=0, lanes=before) + _element("split", pos=f"{-split:.2f}", lanes=after)
+        ends = {"from": start, "to": end, "shape": points, "numLanes": lanes, "priority": priority}
+        text = _element("edge", id=name, **ends, speed=f"{speed:.2f}", width=f"{width:.2f}")
+        self.edges.append(text[:-2] + ">" + splits + "</edge>" if splits else text)
 
     def connect(self, start: str, end: str, *lanes: tuple[int, int]) -> None:
         """Which lane of one edge leads to which of the next."""
@@ -80,7 +80,7 @@ def junction(rng: np.random.Generator, variant: int) -> Plan:
     """Four arms, signals, lanes for turning left on some of them."""
     plan = Plan()
     plan.node("c", np.zeros(2), type="traffic_light")
-    angles = np.arange(4) * math.pi / 2 + rng.uniform(-0.4, 0.4, 4) + rng.uniform(0, math.pi / 2)
+    angles = np.arange(4) * math.pi / 2 + rng.uniform(-0.3, 0.3, 4) + rng.uniform(0, math.pi / 2)
     main, width = 2 + variant % 2, rng.uniform(3.1, 3.75)
     side = int(rng.integers(1, main + 1))
     for arm, angle in enumerate(angles):
@@ -98,7 +98,7 @@ def t_junction(rng: np.random.Generator, variant: int) -> Plan:
     main = 1 + variant // 2 % 2
     for arm, angle in enumerate((0.0, math.pi + bend, side)):
         lanes = main if arm < 2 else 1
-        pocket = float(rng.uniform(30, 50)) if arm == 0 or (arm == 2 and rng.random() < 0.5) else 0.0
+        pocket = float(rng.uniform(30, 50)) if arm == 1 or (arm == 2 and rng.random() < 0.5) else 0.0
         _arm(plan, f"{arm}", turned + angle, rng, lanes, width, pocket, priority=9 if arm < 2 else 3)
     return plan
 
@@ -107,11 +107,13 @@ def roundabout(rng: np.random.Generator, variant: int) -> Plan:
     """A ring with three to five arms."""
     plan = Plan()
     arms, ring_lanes = 3 + variant % 3, 1 + (variant // 2) % 2
-    radius = float(rng.uniform(15, 20) + 4 * (arms - 3) + 4 * (ring_lanes - 1))
+    radius = float(rng.uniform(15, 20) + 3 * (arms - 3) + 8 * (ring_lanes - 1))
     width = rng.uniform(3.2, 3.75)
     spread = 2 * math.pi / arms
     angles = np.arange(arms) * spread + rng.uniform(-0.14, 0.14, arms) * spread + rng.uniform(0, 2 * math.pi)
-    half = 8.0 / radius  # from an arm's middle line to where its entry and exit meet the ring [rad]
+    half = (
+        5.0 + 3.5 * ring_lanes
+    ) / radius  # from an arm's middle line to where its entry and exit meet the ring [rad]
     on_ring = [
         (f"{kind}{arm}", angles[arm] + sign * half) for arm in range(arms) for kind, sign in (("x", -1), ("e", 1))
     ]
@@ -122,16 +124,20 @@ def roundabout(rng: np.random.Generator, variant: int) -> Plan:
         steps = np.linspace(a, b, max(3, round((b - a) * radius / 4)))
         plan.edge(f"ring_{start}", start, end, radius * _units(steps), ring_lanes, 8.3, width + 0.4, priority=9)
     for arm, angle in enumerate(angles):
-        line = _line(radius + 14.0, _EXTENT, angle, rng.uniform(-0.003, 0.003))
-        lanes = ring_lanes
+        line = _line(radius + 6.0 + 10.0 * ring_lanes, _EXTENT, angle, rng.uniform(-0.003, 0.003))
         plan.node(f"n{arm}", line[-1])
         entry, exit_ = (radius * _unit(dict(on_ring)[f"{kind}{arm}"]) for kind in "ex")
-        # Both meet the ring half along it, half towards its centre.
-        flare_in = _bend(line[0], -_unit(angle), entry, _unit(angle + half + math.pi / 2) - 0.9 * _unit(angle + half))
-        flare_out = _bend(exit_, _unit(angle - half + math.pi / 2) + 0.9 * _unit(angle - half), line[0], _unit(angle))
-        common = {"lanes": lanes, "speed": _TOWN, "width": width, "priority": 3}
-        plan.edge(f"in{arm}", f"n{arm}", f"e{arm}", np.vstack([line[:0:-1], flare_in]), **common)  # type: ignore[arg-type]
-        plan.edge(f"out{arm}", f"x{arm}", f"n{arm}", np.vstack([flare_out, line[1:]]), **common)  # type: ignore[arg-type]
+        # Both meet the ring partly along it, partly towards its centre.
+        flare_in = _bend(line[0], -_unit(angle), entry, _unit(angle + half + math.pi / 2) - 1.2 * _unit(angle + half))
+        flare_out = _bend(exit_, _unit(angle - half + math.pi / 2) + 1.2 * _unit(angle - half), line[0], _unit(angle))
+        plan.node(f"f{arm}", line[0])
+        for name, start, end, shape in (
+            (f"in{arm}", f"n{arm}", f"f{arm}", line[::-1]),
+            (f"flare_in{arm}", f"f{arm}", f"e{arm}", flare_in),
+            (f"flare_out{arm}", f"x{arm}", f"f{arm}", flare_out),
+            (f"out{arm}", f"f{arm}", f"n{arm}", line),
+        ):
+            plan.edge(name, start, end, shape, ring_lanes, _TOWN, width, priority=3)
     return plan
 
 
@@ -147,38 +153,33 @@ def highway(rng: np.random.Generator, variant: int) -> Plan:
     middle = np.vstack([behind[:0:-1], ahead])
     for side, line in (("a", middle), ("b", middle[::-1])):
         line = _shifted(line, median)
-        cuts = np.array([0.0, 0.16, 0.40, 0.60, 0.84, 1.0]) + np.r_[0.0, rng.uniform(-0.03, 0.03, 4), 0.0]
+        cuts = np.array([0.0, 0.18, 0.42, 0.58, 0.82, 1.0]) + np.r_[0.0, rng.uniform(-0.03, 0.03, 4), 0.0]
         parts = _cut(line, cuts)
-        for index, part in enumerate(parts):
-            plan.node(f"{side}{index}", part[0], type="priority")
         plan.node(f"{side}5", line[-1])
         for index, part in enumerate(parts):
-            # Spreading to the right keeps the left lane in place; the exit's and the entry's lane come on the right.
-            extra = index in (1, 3)
-            name = f"{side}{index}"
-            plan.edge(name, name, f"{side}{index + 1}", part, lanes + extra, _HIGHWAY, width, priority=12)
+            # From the entry on, and up to the exit, there is one lane more, on the right: the left one stays in place.
+            plan.node(f"{side}{index}", part[0], type="priority")
+            here, before = (lanes + (at in (1, 3)) for at in (index, index - 1))
+            plan.edge(
+                f"{side}{index}", f"{side}{index}", f"{side}{index + 1}", part, here, _HIGHWAY, width, priority=12
+            )
             if index:
-                shift = int(extra) - int(index in (2, 4))
-                pairs = [
-                    (k, k + shift)
-                    for k in range(lanes + 1)
-                    if 0 <= k + shift < lanes + extra and k < lanes + (index in (2, 4))
-                ]
-                plan.connect(f"{side}{index - 1}", name, *pairs, *([(0, 0)] if extra else []))
-        outwards = rng.uniform(0.35, 0.6)
-        for kind, at, direction in (("exit", parts[2], 1), ("entry", parts[3], -1)):
-            along = _direction(at[:2]) * direction
-            left = np.array([-along[1], along[0]]) * direction
-            corner = at[0] - left * width * lanes  # where the lane beside the road's own lanes has its left edge
-            angle = math.atan2(along[1], along[0]) - direction * 0.12
-            ramp = corner + _line(0.0, 120.0, angle, -direction * outwards / 120.0)
+                pairs = [(before - k, here - k) for k in range(1, lanes + 1)]  # counted from the left
+                plan.connect(f"{side}{index - 1}", f"{side}{index}", *pairs)
+        away = rng.uniform(0.35, 0.6) / 120.0
+        for kind, node, along in (("entry", 1, -1), ("exit", 4, 1)):
+            ahead = _direction(parts[node][:2])
+            right = np.array([ahead[1], -ahead[0]])
+            angle = math.atan2(*(along * ahead)[::-1]) - along * 0.12
+            ramp = parts[node][0] + width * lanes * right + _line(0.0, 120.0, angle, -along * away)
             plan.node(f"{side}{kind}", ramp[-1])
-            if direction == 1:
-                plan.edge(f"{side}{kind}", f"{side}2", f"{side}{kind}", ramp, 1, _RAMP, width, priority=7)
-                plan.connect(f"{side}1", f"{side}{kind}", (0, 0))
+            ends = (f"{side}{node}", f"{side}{kind}")
+            if kind == "entry":
+                plan.edge(f"{side}entry", *ends[::-1], ramp[::-1], 1, _RAMP, width, priority=7)
+                plan.connect(f"{side}entry", f"{side}1", (0, 0))
             else:
-                plan.edge(f"{side}{kind}", f"{side}{kind}", f"{side}3", ramp[::-1], 1, _RAMP, width, priority=7)
-                plan.connect(f"{side}{kind}", f"{side}3", (0, 0))
+                plan.edge(f"{side}exit", *ends, ramp, 1, _RAMP, width, priority=7)
+                plan.connect(f"{side}3", f"{side}exit", (0, 0))
     return plan
 
 
@@ -191,7 +192,7 @@ def residential(rng: np.random.Generator, variant: int) -> Plan:
     swing = 24.0 * (np.sin(2 * math.pi * waves * along / _EXTENT + phase) - np.sin(phase))
     street = np.column_stack([along, swing]) @ np.array([_unit(turned), _unit(turned + math.pi / 2)])
     sides = 3 + variant % 3
-    cuts = (np.arange(sides) + 0.5 + rng.uniform(-0.25, 0.25, sides)) / sides
+    cuts = 0.15 + 0.7 * (np.arange(sides) + 0.5 + rng.uniform(-0.25, 0.25, sides)) / sides
     parts = _cut(street, np.r_[0.0, cuts, 1.0])
     for index, part in enumerate(parts):
         inside = index > 0
@@ -202,11 +203,17 @@ def residential(rng: np.random.Generator, variant: int) -> Plan:
         plan.edge(f"main{index}", start, end, part, 1, _RESIDENTIAL, width, priority=5)
         plan.edge(f"back{index}", end, start, part[::-1], 1, _RESIDENTIAL, width, priority=5)
     first = int(rng.integers(2))
+    taken = [street]
     for index in range(1, sides + 1):
         heading = math.atan2(*_direction(parts[index][:2])[::-1])
         for sign in (1, -1) if rng.random() < 0.35 else ((1,) if (index + first) % 2 else (-1,)):
-            angle = heading + sign * (math.pi / 2 + rng.uniform(-0.3, 0.3))
-            side = parts[index][0] + _line(0.0, rng.uniform(90, 150), angle, rng.uniform(-0.005, 0.005))
+            while True:
+                angle = heading + sign * (math.pi / 2 + rng.uniform(-0.3, 0.3))
+                side = parts[index][0] + _line(0.0, rng.uniform(70, 140), angle, rng.uniform(-0.005, 0.005))
+                apart = np.vstack(taken)[:, None] - side[None, 4:]
+                if np.hypot(*apart.T).min() > 20.0:
+                    break
+            taken.append(side)
             name = f"{index}{'l' if sign > 0 else 'r'}"
             plan.node(f"s{name}", side[-1])
             plan.edge(f"from{name}", f"s{name}", f"m{index}", side[::-1], 1, _RESIDENTIAL, width, priority=3)
@@ -231,14 +238,16 @@ def _arm(
     lanes: int,
     width: float,
     pocket: float,
-    **attributes: object,
+    priority: int = 5,
 ) -> None:
     """A road of `lanes` each way from the node "c" outwards, straight or curved."""
     curvature = float(rng.choice([0.0, 1.0, -1.0])) * rng.uniform(1 / 500, 1 / 180)
-    line = _line(0.0, _EXTENT, angle, curvature, straight=55.0)
-    plan.node(f"n{name}", line[-1])
-    plan.edge(f"in{name}", f"n{name}", "c", line[::-1], lanes + bool(pocket), _TOWN, width, pocket, **attributes)
-    plan.edge(f"out{name}", "c", f"n{name}", line, lanes, _TOWN, width, **attributes)
+    straight, end = pocket or 50.0, f"n{name}"
+    line = _line(0.0, _EXTENT, angle, curvature, straight)
+    plan.node(end, line[-1])
+    arriving, more = line[::-1], bool(pocket)
+    plan.edge(f"in{name}", end, "c", arriving, lanes + more, _TOWN, width, straight, more, priority=priority)
+    plan.edge(f"out{name}", "c", end, line, lanes, _TOWN, width, -straight, priority=priority)
 
 
 def _line(start: float, end: float, angle: float, curvature: float, straight: float = 0.0) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -53,7 +53,7 @@ class EpisodeSettings(Settings):
     snapshots: Annotated[int, Field(ge=1, le=1000)] = 3
     agents: Annotated[int, Field(ge=1, le=100)] = 4
     interval: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
-    lidars: dict[str, float] = {"opv2v": 1.0}
+    lidars: dict[str, float] = Field(default={"opv2v": 1.0})
     vary_sensor: bool = True
     keep_own_points: Annotated[float, Field(ge=0.0, le=1.0)] = 0.4
 
@@ -73,7 +73,7 @@ class SimulatedEpisodes:
 
     split: str
     seed: int = 0
-    settings: EpisodeSettings = EpisodeSettings()
+    settings: EpisodeSettings = field(default_factory=EpisodeSettings)
 
     def __post_init__(self) -> None:
         if self.split not in NETWORKS:
@@ -101,8 +101,8 @@ class SimulatedEpisodes:
                 now = world.at(traffic.vehicles())
                 agents = _agents(now.moving, self.settings.agents, rng)
                 sensors = [(now.sensor_on_vehicle(agent, lidar, rng), agent) for agent in agents]
-                for view in now.views(sensors, [lidar] * len(sensors), snapshot):
-                    clouds.append(_labelled(view, keep_own=rng.random() < self.settings.keep_own_points))
+                views = now.views(sensors, [lidar] * len(sensors), snapshot)
+                clouds += [_labelled(view, rng.random() < self.settings.keep_own_points) for view in views]
         return clouds
 
 

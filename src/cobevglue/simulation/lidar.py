@@ -1,7 +1,7 @@
 """A spinning LiDAR: rays of a beam table, cast through a scene of triangles with Embree, with a sensor's imperfections.
 
-The default is the sensor of OPV2V, that is CARLA's ray-cast LiDAR as OPV2V set it: 64 beams from -25 to +2 degrees, 1016
-shots a turn, 120 m, 2 cm range noise, one point in ten lost, all points of one instant.
+The default is the sensor of OPV2V, that is CARLA's ray-cast LiDAR as OPV2V set it: 64 beams from -25 to +2 degrees,
+1016 shots a turn, 120 m, 2 cm range noise, one point in ten lost, all points of one instant.
 """
 
 from __future__ import annotations

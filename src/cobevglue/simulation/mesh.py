@@ -1,4 +1,4 @@
-"""Triangle meshes with what a LiDAR needs to know of a surface, and the primitives that shapes are put together from."""
+"""Triangle meshes with what a LiDAR needs to know of a surface, and the primitives that shapes are made of."""
 
 from __future__ import annotations
 

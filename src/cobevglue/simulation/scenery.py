@@ -1,4 +1,4 @@
-"""What stands beside the roads: uneven ground, kerbs, buildings, walls, poles, trees, street furniture, parked vehicles.
+"""What stands beside the roads: uneven ground, kerbs, buildings, walls, poles, trees, furniture, parked vehicles.
 
 Each world draws its own character: how built-up it is, how green, how hilly, how many vehicles park.
 """

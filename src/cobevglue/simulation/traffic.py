@@ -13,9 +13,11 @@ simulation a process; hence one open `Traffic` at a time.
 from __future__ import annotations
 
 import math
+import tempfile
 import weakref
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Annotated, Any, NamedTuple
 
@@ -74,11 +76,11 @@ _IN_HOUSING = MappingProxyType({"truck": 0.3, "bus": 0.3})  # how much rarer the
 # How fast traffic flows, as a share of the speed limits, and how many vehicles there are per 100 m of lane.
 _FLOW = MappingProxyType(
     {
-        "junction": ((0.8, 1.1), (0.8, 4.0)),
-        "t_junction": ((0.8, 1.1), (1.2, 4.5)),
-        "roundabout": ((0.8, 1.1), (1.2, 4.5)),
-        "highway": ((0.25, 1.0), (0.8, 4.0)),
-        "residential": ((0.7, 1.1), (0.8, 2.5)),
+        "junction": ((0.8, 1.1), (1.2, 4.2)),
+        "t_junction": ((0.8, 1.1), (1.8, 5.0)),
+        "roundabout": ((0.8, 1.1), (1.8, 5.0)),
+        "highway": ((0.25, 1.0), (1.0, 4.0)),
+        "residential": ((0.7, 1.1), (1.2, 3.2)),
     }
 )
 
@@ -225,7 +227,7 @@ class Traffic:
         if steps < 1 or abs(steps * _STEP - seconds) > 1e-6:
             raise ValueError(f"seconds must be a positive multiple of {_STEP}, got {seconds}")
         for _ in range(steps):
-            if self._steps % _STEPS_PER_DEMAND == 0:
+            if self._steps and self._steps % _STEPS_PER_DEMAND == 0:
                 self._replace_those_gone()
             self._sumo.simulationStep()
             self._steps += 1
@@ -262,26 +264,25 @@ class Traffic:
     def _start(self, speed_factor: float) -> None:
         """Start SUMO, put vehicles all along the roads, and let them sort themselves out."""
         sumo, rng = self._sumo, self._rng
-        options = ["--net-file", str(network_file(self.network)), "--seed", str(self.seed % 2**31)]
-        options += ["--step-length", str(_STEP), "--lateral-resolution", str(_LATERAL_RESOLUTION)]
-        options += ["--time-to-teleport", "-1", "--collision.action", "none", "--max-depart-delay", str(_PATIENCE)]
-        options += ["--no-step-log", "--no-warnings", "--duration-log.disable"]
-        sumo.start(["sumo", *options])
+        with tempfile.TemporaryDirectory() as folder:
+            types = Path(folder) / "types.add.xml"
+            types.write_text(_vehicle_types())
+            options = ["--net-file", str(network_file(self.network)), "--additional-files", str(types)]
+            options += ["--seed", str(self.seed % 2**31), "--step-length", str(_STEP)]
+            options += ["--lateral-resolution", str(_LATERAL_RESOLUTION), "--max-depart-delay", str(_PATIENCE)]
+            options += ["--time-to-teleport", "-1", "--collision.action", "none"]
+            options += ["--no-step-log", "--no-warnings", "--duration-log.disable"]
+            sumo.start(["sumo", *options])
         for lane in self.roads.lanes:
             sumo.lane.setMaxSpeed(lane.id, lane.speed_limit * speed_factor)
         for name in sumo.trafficlight.getIDList():
             phases = len(sumo.trafficlight.getAllProgramLogics(name)[0].phases)
             sumo.trafficlight.setPhase(name, int(rng.integers(phases)))
-        for kind, facts in _KINDS.items():
-            sumo.vehicletype.copy("DEFAULT_VEHTYPE", kind)
-            sumo.vehicletype.setVehicleClass(kind, facts.sumo_class)
-            sumo.vehicletype.setAccel(kind, facts.acceleration)
-            sumo.vehicletype.setMaxSpeed(kind, facts.top_speed)
         rare = np.array([1.0 if self.roads.kind != "residential" else _IN_HOUSING.get(kind, 1.0) for kind in _KINDS])
         shares = rare * [facts.share for facts in _KINDS.values()]
         self._kind_shares = shares / shares.sum()
         self._route_shares = self._draw_route_shares()
-        self._lane_length = Counter[str]()
+        self._lane_length = dict.fromkeys((lane.edge for lane in self.roads.lanes), 0.0)
         for lane in self.roads.lanes:
             self._lane_length[lane.edge] += lane.length
         for _ in range(self.target):
@@ -297,7 +298,8 @@ class Traffic:
         ends = sorted({edge for route in self.roads.routes for edge in (route[0], route[-1])})
         busy = {edge: self._rng.uniform(0.3, 1.0) * roads[edge] for edge in ends}
         weight = np.array([busy[route[0]] * busy[route[-1]] for route in self.roads.routes])
-        return weight / weight.sum()
+        shares: FloatArray = weight / weight.sum()
+        return shares
 
     def _replace_those_gone(self) -> None:
         """Add vehicles at the fringe until there are as many as there should be, those still waiting included."""
@@ -317,8 +319,8 @@ class Traffic:
             sumo.route.add(self._routes[edges], edges)
         kind = VEHICLE_KINDS[int(rng.choice(len(VEHICLE_KINDS), p=self._kind_shares))]
         facts = _KINDS[kind]
-        # One draw for how big it is as a whole, and a little of each dimension's own: long vehicles tend to be wide.
-        shares = np.clip(rng.uniform() + rng.uniform(-0.25, 0.25, 3), 0.0, 1.0)
+        # Mostly one draw for how big it is as a whole: long vehicles tend to be wide and high.
+        shares = 0.7 * rng.uniform() + 0.3 * rng.uniform(size=3)
         size = [low + share * (high - low) for share, (low, high) in zip(shares, facts[1:4], strict=True)]
         beside = min(self.settings.lateral_offset, max(0.0, (self._narrowest - size[1]) / 2 - _EDGE_MARGIN))
         name = str(len(self._known))
@@ -340,6 +342,20 @@ class Traffic:
     def _refuse_closed(self) -> None:
         if _open is None or _open() is not self:
             raise RuntimeError("this Traffic is closed")
+
+
+def _vehicle_types() -> str:
+    """The kinds as SUMO wants them."""
+    lines = []
+    for kind, facts in _KINDS.items():
+        # Sideways only while driving, and the slower the longer: a vehicle that stands across two lanes is in the way,
+        # and SUMO does not know that turned ones need more room.
+        turn = 0.2 if facts.length[1] < 6.0 else 0.08
+        lines.append(
+            f'<vType id="{kind}" vClass="{facts.sumo_class}" accel="{facts.acceleration}" maxSpeed="{facts.top_speed}"'
+            f' lcMaxSpeedLatStanding="0" lcMaxSpeedLatFactor="{turn}"/>'
+        )
+    return "<additional>\n" + "\n".join(lines) + "\n</additional>\n"
 
 
 _open: weakref.ref[Traffic] | None = None

@@ -1,9 +1,9 @@
 """Vehicles as shapes: a body lofted over cross sections, with cabin, windows, wheels and mirrors.
 
-A body is given by its side view, a few stations from rear to front in shares of length and height, and by how it narrows
-in the plan view; all of it varies from vehicle to vehicle. A LiDAR then sees what it sees of real cars: a bonnet lower
-than the roof, corners that are round, sides that lean in, wheels below the sill, and mirrors that stick out, so that the
-box around the vehicle (which counts them in, as CARLA's boxes do) is wider than its body.
+A body is given by its side view, a few stations from rear to front in shares of length and height, and by how it
+narrows in the plan view; all of it varies from vehicle to vehicle. A LiDAR then sees what it sees of real cars: a
+bonnet lower than the roof, round corners, sides that lean in, wheels below the sill, and mirrors that stick out, so
+that the box around the vehicle (which counts them in, as CARLA's boxes do) is wider than its body.
 """
 
 from __future__ import annotations
@@ -376,7 +376,7 @@ def _car(body: _Body, size: FloatArray, rng: np.random.Generator) -> Mesh:
         x = (axle - 0.5) * length
         for side in (-1, 1):
             middle = (x, side * (half_width - tread / 2 + 0.015), radius)
-            parts.append(cylinder(middle, radius, tread, _TYRE, axis="y", sides=10))
+            parts.append(cylinder(middle, radius, tread, _TYRE, axis="y"))
     stations = np.array(body.stations)
     windscreen = np.flatnonzero(stations[:, 2] - stations[:, 1] > 0.12)[-1]
     mirror_x = min((stations[windscreen, 0] - 0.5) * length + rng.uniform(0.05, 0.35), 0.5 * length - 0.15)
@@ -407,7 +407,6 @@ def _shell(body: _Body, length: float, half_width: float, height: float, paint: 
             np.stack([x, -w, flank_z], axis=1),
             np.stack([x, -0.95 * w, shoulder_z - 0.5 * crown], axis=1),
             np.stack([x, -roof_w, roof_z - crown], axis=1),
-            np.stack([x, -0.6 * roof_w, roof_z - 0.3 * crown], axis=1),
             np.stack([x, 0.0 * w, roof_z], axis=1),
         ],
         axis=1,
@@ -452,8 +451,8 @@ def _motorcycle(rng: np.random.Generator) -> Mesh:
     paint = float(rng.uniform(*_PAINT))
     lean = rng.uniform(0.0, 0.25)
     parts = [
-        cylinder((-0.72, 0.0, 0.31), 0.31, 0.14, _TYRE, axis="y", sides=10),
-        cylinder((0.72, 0.0, 0.31), 0.31, 0.12, _TYRE, axis="y", sides=10),
+        cylinder((-0.72, 0.0, 0.31), 0.31, 0.14, _TYRE, axis="y"),
+        cylinder((0.72, 0.0, 0.31), 0.31, 0.12, _TYRE, axis="y"),
         box((0.0, 0.0, 0.6), (1.1, 0.26, 0.45), reflectivity=paint),
         box((-0.45, 0.0, 0.85), (0.7, 0.28, 0.12), reflectivity=_INSIDE),
         box((0.5, 0.0, 1.02), (0.08, 0.75, 0.08), reflectivity=paint),

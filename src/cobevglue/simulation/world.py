@@ -1,4 +1,4 @@
-"""A simulated world: a road network with its surroundings, the traffic on it at one time, and what a LiDAR sees of it."""
+"""A simulated world: a road network with its surroundings, the traffic at one time, and what a LiDAR sees of it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ __all__ = ["LidarView", "World", "WorldAtTime"]
 _SCENERY_STREAM, _SHAPE_STREAM, _SCAN_STREAM = 20, 21, 22
 _FIRST_PARKED_ID = 100_000
 """Parked vehicles have ids from here on, moving ones below."""
-_SIGHT = 150.0
-"""Vehicles farther than this from all sensors are left out of the scene [m]."""
+_MARGIN = 7.0
+"""Vehicles whose centre is farther beyond the range of all sensors than this are left out of the scene [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -154,8 +154,9 @@ class WorldAtTime:
         if not sensors:
             return []
         places = np.array([pose[:2, 3] for pose, _ in sensors])
-        away = np.hypot(*(self.moving.center[:, None, :2] - places[None]).T).min(axis=0)
-        scene = _owned(self.world._meshes(self.moving[away < _SIGHT]))
+        reach = np.array([lidar.range + _MARGIN for lidar in settings])
+        near = (np.hypot(*(self.moving.center[:, None, :2] - places[None]).transpose(2, 0, 1)) < reach).any(axis=1)
+        scene = _owned(self.world._meshes(self.moving[near]))
         return [
             self._view(scene, pose, carrier, lidar, np.random.default_rng([self.world.seed, _SCAN_STREAM + i, index]))
             for i, ((pose, carrier), lidar) in enumerate(zip(sensors, settings, strict=True))
