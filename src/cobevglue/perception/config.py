@@ -93,8 +93,8 @@ class PointPillarsConfig(Settings):
     pillar_channels: _Count = 32
     block_layers: tuple[_Count, _Count, _Count] = (1, 2, 2)
     block_channels: tuple[_Count, _Count, _Count] = (48, 96, 128)
-    up_channels: _Count = 64
-    shrink_channels: _Count = 64
+    up_channels: _Count = 48
+    shrink_channels: _Count = 48
     shrink_kernel: Annotated[int, Field(ge=1, le=3)] = 1
     anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)] = (
         Anchor(length=4.4, width=2.0, height=1.6, z=-1.0),
