@@ -50,8 +50,8 @@ class EpisodeSettings(Settings):
         keep_own_points: share of clouds that keep the points on the agent's own body.
     """
 
-    snapshots: Annotated[int, Field(ge=1, le=1000)] = 3
-    agents: Annotated[int, Field(ge=1, le=100)] = 4
+    snapshots: Annotated[int, Field(ge=1, le=1000)] = 4
+    agents: Annotated[int, Field(ge=1, le=100)] = 5
     interval: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
     lidars: dict[str, float] = Field(default={"opv2v": 1.0})
     vary_sensor: bool = True

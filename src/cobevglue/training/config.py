@@ -70,7 +70,7 @@ class ValidationConfig(Settings):
     """
 
     every: _Count = 1
-    episodes: Annotated[int, Field(ge=0)] = 16
+    episodes: Annotated[int, Field(ge=0)] = 12
     score: Literal["ap_0.5", "ap_0.7"] = "ap_0.7"
 
 
@@ -120,7 +120,7 @@ PRESETS: dict[str, TrainDetectorConfig] = {
     "compact": TrainDetectorConfig(
         data=DataConfig(min_points=2),
         augmentation=AugmentationConfig(rotation=0.4),
-        optimisation=OptimisationConfig(epochs=30, samples_per_epoch=500),
+        optimisation=OptimisationConfig(epochs=24, samples_per_epoch=500),
         validation=ValidationConfig(every=5, episodes=8),
     ),
     # Its range is long and narrow: turned by more than this, most of a scene would leave it.
@@ -128,6 +128,7 @@ PRESETS: dict[str, TrainDetectorConfig] = {
         model=CONFIGS["opv2v"],
         augmentation=AugmentationConfig(rotation=math.pi / 4),
         optimisation=OptimisationConfig(epochs=60, samples_per_epoch=6000),
+        data=DataConfig(workers=8),
     ),
     # Seconds, to see that everything works; it finds nothing.
     "tiny": TrainDetectorConfig(
