@@ -11,6 +11,7 @@ SUMO networks, made by `tools/build_networks.py`; reading them needs neither SUM
 from __future__ import annotations
 
 import gzip
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ NETWORKS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
 NETWORKS_FOLDER = Path(__file__).parent / "networks"
 
 _DEFAULT_LANE_WIDTH = 3.2  # SUMO's, where the file has none [m]
-_CHUNK = 4096  # points compared with all segments at once
+_CELL = 16.0  # points of one such square are compared with the same few segments [m]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -162,17 +163,20 @@ class RoadNetwork:
         """(M,) how far points (M, 2) are from the nearest road surface [m]; 0 on it."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         distance = np.empty(len(points))
-        start, step, half_width = self._segments
-        squared_length = np.maximum((step**2).sum(axis=1), 1e-12)
-        for first in range(0, len(points), _CHUNK):
-            here = points[first : first + _CHUNK]
-            x, y = (here[:, None, axis] - start[None, :, axis] for axis in (0, 1))
-            share = np.clip((x * step[:, 0] + y * step[:, 1]) / squared_length, 0.0, 1.0)
-            x -= share * step[:, 0]
-            y -= share * step[:, 1]
-            distance[first : first + _CHUNK] = (np.hypot(x, y) - half_width).min(axis=1)
+        if not len(points):
+            return distance
+        segments = self._segments
+        cells, member = np.unique(np.floor(points / _CELL), axis=0, return_inverse=True)
+        from_centre = _distances((cells + 0.5) * _CELL, segments)
+        # No point of a cell is farther than half its diagonal from its centre: only these can be nearest to one.
+        eligible = from_centre <= from_centre.min(axis=1, keepdims=True) + math.sqrt(2.0) * _CELL
+        order = np.argsort(member.ravel(), kind="stable")
+        for rows, few in zip(np.split(order, np.cumsum(np.bincount(member.ravel()))[:-1]), eligible, strict=True):
+            distance[rows] = _distances(points[rows], segments[few]).min(axis=1)
         for junction in self.junctions:
-            distance[_inside(points, junction.polygon)] = 0.0
+            low, high = junction.polygon.min(axis=0), junction.polygon.max(axis=0)
+            about = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+            distance[about[_inside(points[about], junction.polygon)]] = 0.0
         return np.maximum(distance, 0.0)
 
     def roadside(self, spacing: float, offset: float = 0.0) -> Roadside:
@@ -196,13 +200,13 @@ class RoadNetwork:
         return Roadside(np.concatenate(xy), np.concatenate(yaw), np.array(edge, dtype=np.str_))
 
     @cached_property
-    def _segments(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(S, 2) starts, (S, 2) steps and (S,) half widths of lane pieces and, without width, of junction outlines."""
+    def _segments(self) -> FloatArray:
+        """(S, 5) start, step and half width of lane pieces and, without width, of junction outlines."""
         lines = [(lane.centerline, lane.width / 2) for lane in self.lanes]
         lines += [(np.vstack([junction.polygon, junction.polygon[:1]]), 0.0) for junction in self.junctions]
-        start = np.concatenate([line[:-1] for line, _ in lines])
-        step = np.concatenate([np.diff(line, axis=0) for line, _ in lines])
-        return start, step, np.concatenate([np.full(len(line) - 1, half) for line, half in lines])
+        return np.concatenate(
+            [np.column_stack([line[:-1], np.diff(line, axis=0), np.full(len(line) - 1, half)]) for line, half in lines]
+        )
 
 
 def network_file(name: str) -> Path:
@@ -239,7 +243,7 @@ def _routes(root: ElementTree.Element) -> Iterator[tuple[str, ...]]:
         if start in following and end not in following[start]:
             following[start].append(end)
     for source in sorted(set(following).difference(*following.values())):
-        reached = {source: (source,)}
+        reached: dict[str, tuple[str, ...]] = {source: (source,)}
         queue = deque([source])
         while queue:
             here = queue.popleft()
@@ -263,6 +267,15 @@ def _sample(line: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
     xy = np.column_stack([np.interp(at, length, line[:, axis]) for axis in (0, 1)])
     piece = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(step) - 1)
     return xy, np.arctan2(step[piece, 1], step[piece, 0])
+
+
+def _distances(points: FloatArray, segments: FloatArray) -> FloatArray:
+    """(M, S) how far points (M, 2) are outside of segments (S, 5) with a width; negative inside."""
+    step_x, step_y = segments[:, 2], segments[:, 3]
+    x, y = (points[:, None, axis] - segments[None, :, axis] for axis in (0, 1))
+    share = np.clip((x * step_x + y * step_y) / np.maximum(step_x**2 + step_y**2, 1e-12), 0.0, 1.0)
+    distance: FloatArray = np.hypot(x - share * step_x, y - share * step_y) - segments[:, 4]
+    return distance
 
 
 def _inside(points: FloatArray, polygon: FloatArray) -> BoolArray:
