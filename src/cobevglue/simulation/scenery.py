@@ -360,4 +360,5 @@ def _outline(x: float, y: float, yaw: float, length: float, width: float) -> Flo
         ]
     ) * [length, width]
     c, s = np.cos(yaw), np.sin(yaw)
-    return edge @ np.array([[c, s], [-s, c]]) + [x, y]
+    outline: FloatArray = edge @ np.array([[c, s], [-s, c]]) + [x, y]
+    return outline
