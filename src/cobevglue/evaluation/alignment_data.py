@@ -1,4 +1,4 @@
-"""Sequences to measure aligners on, from recorded detections, from noisy labels, or simulated.
+"""Sequences to measure aligners on: from recorded detections, from noisy labels, or from clouds through a detector.
 
 The identity that V2V4Real's detection files store (both cars' boxes already in ego's frame) never reaches an aligner:
 other's boxes are moved into a frame that drives smoothly through the scene before anything sees them.
@@ -8,22 +8,33 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cobevglue.boxes import Boxes
-from cobevglue.datasets import Dataset, Scenario
+from cobevglue.datasets import AgentFrame, Dataset, Scenario
 from cobevglue.datasets.tracking_text import count_frames, read_v2v4real_detections, read_v2v4real_labels
 from cobevglue.disturbance.detection_errors import DetectionErrors, add_detection_errors
 from cobevglue.evaluation.alignment import AlignmentSequence, PairFrame
+from cobevglue.iou import bev_iou
 from cobevglue.se2 import SE2
 from cobevglue.tracking import Sort
-from cobevglue.typing import IntArray
+from cobevglue.typing import Float32Array, IntArray
 
-__all__ = ["V2V4REAL_TRAIN", "V2V4REAL_VAL", "noisy_label_sequences", "smooth_drive", "v2v4real_sequences"]
+__all__ = [
+    "V2V4REAL_TRAIN",
+    "V2V4REAL_VAL",
+    "Perceived",
+    "Perceiver",
+    "noisy_label_sequences",
+    "perceived_sequences",
+    "smooth_drive",
+    "v2v4real_sequences",
+]
 
 V2V4REAL_TRAIN = tuple(f"train/{i:04d}" for i in range(11))
 """Detection sequences the defaults were tuned on."""
@@ -33,6 +44,8 @@ V2V4REAL_VAL = ("val/0001", "val/0004", "val/0005", "val/0008")
 _FRAME = 0.1
 _DETECTED_WITHIN, _DETECTED_TURN = 2.5, math.radians(30.0)
 """A detection is of a labelled object when this close [m] and, modulo pi, this well turned [rad]."""
+_DETECTED_IOU = 0.1
+"""A detection is of an exactly known object when they overlap by more."""
 _DRIVE_STREAM, _ERROR_STREAM = 0, 1
 _FALSE = np.iinfo(np.int64).min
 """Object id of a false box; no data set uses it."""
@@ -148,3 +161,70 @@ def _detect(
             ids[rows >= 0] = objects.track_id[rows[rows >= 0]]
         seen[i] = tracker.update(boxes), ids
     return seen
+
+
+class Perceived(Protocol):
+    """What one agent made of a cloud, such as `PerceptionOutput`."""
+
+    @property
+    def boxes(self) -> Boxes:
+        """Tracked boxes in the agent's LiDAR frame."""
+        ...
+
+
+class Perceiver(Protocol):
+    """Detector and tracker of one agent, such as `Perception`."""
+
+    def step(self, points: Float32Array, /) -> Perceived:
+        """The agent's next cloud (N, 4)."""
+        ...
+
+
+def perceived_sequences(
+    scenarios: Iterable[Scenario], make_perceiver: Callable[[], Perceiver]
+) -> Iterator[AlignmentSequence]:
+    """Every pair of agents of every scenario, each agent's boxes detected in its own clouds and tracked.
+
+    Frames in which one of the two has no cloud are left out.
+
+    Args:
+        scenarios: with clouds, exact poses and object ids.
+        make_perceiver: makes a new detector and tracker for an agent; called once for each.
+    """
+    for scenario in scenarios:
+        names = sorted({name for frame in scenario for name in frame.agents})
+        perceivers = {name: make_perceiver() for name in names}
+        frames: dict[tuple[str, str], list[PairFrame]] = {pair: [] for pair in itertools.combinations(names, 2)}
+        for frame in scenario:
+            seen = {
+                name: (perceivers[name].step(agent.points).boxes, agent)
+                for name, agent in frame.agents.items()
+                if agent.points is not None
+            }
+            for (ego, other), pair_frames in frames.items():
+                if ego in seen and other in seen:
+                    pair_frames.append(_perceived_pair(*seen[ego], *seen[other]))
+        for (ego, other), pair_frames in frames.items():
+            if pair_frames:
+                yield AlignmentSequence(f"{scenario.name}/{ego}-{other}", pair_frames)
+
+
+def _perceived_pair(ego: Boxes, ego_agent: AgentFrame, other: Boxes, other_agent: AgentFrame) -> PairFrame:
+    ids = []
+    for boxes, agent in ((ego, ego_agent), (other, other_agent)):
+        found, object_rows = _found(boxes, agent.objects)
+        assert agent.objects.track_id is not None
+        own = np.full(len(boxes), _FALSE)
+        own[found] = agent.objects.track_id[object_rows]
+        ids.append(own)
+    pairs = np.argwhere((ids[0][:, None] == ids[1][None, :]) & (ids[0][:, None] != _FALSE))
+    truth = SE2.from_matrix(np.linalg.inv(ego_agent.world_SE3_lidar) @ other_agent.world_SE3_lidar)
+    return PairFrame(ego, other, truth, len(pairs), pairs)
+
+
+def _found(detections: Boxes, objects: Boxes) -> tuple[IntArray, IntArray]:
+    """Rows of detections and of the objects they are of: one-to-one, those that overlap most first."""
+    iou = bev_iou(detections, objects)
+    rows, columns = linear_sum_assignment(-iou)
+    overlapping = iou[rows, columns] > _DETECTED_IOU
+    return rows[overlapping], columns[overlapping]
