@@ -81,13 +81,14 @@ class AnchorGrid:
         anchors = self.boxes(index)
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
         turn = wrap_angle(boxes[:, 6] - anchors[:, 6])
-        against = np.abs(turn) > math.pi / 2
+        axis = _half_turn(turn)
+        against = np.abs(turn - axis) > math.pi / 2
         residuals = np.column_stack(
             [
                 (boxes[:, :2] - anchors[:, :2]) / diagonal,
                 (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
                 np.log(boxes[:, 3:6] / anchors[:, 3:6]),
-                _half_turn(turn),
+                axis,
             ]
         )
         return residuals, against.astype(np.int64)
@@ -175,7 +176,7 @@ def assign_targets(boxes: ArrayLike, ignore: ArrayLike, anchors: AnchorGrid) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """P pairs of a box and an anchor that overlap, by box: rows of both, overlap, distance of the centres [m]."""
+    """P pairs of a box and an anchor that overlap, ascending by box: rows, overlap, distance of the centres [m]."""
 
     box: IntArray
     anchor: IntArray
@@ -217,12 +218,14 @@ def _give_the_rest_their_best(owner: IntArray, pairs: _Pairs, wanted: BoolArray)
     poor = wanted.copy()
     poor[owner[owner >= 0]] = False
     merit = pairs.iou - _NEARER * pairs.distance
-    rows = np.flatnonzero(poor[pairs.box])
-    for row in rows[np.argsort(-merit[rows], kind="stable")]:
-        box, anchor = pairs.box[row], pairs.anchor[row]
-        if poor[box] and owner[anchor] < 0:
-            owner[anchor] = box
-            poor[box] = False
+    first = np.searchsorted(pairs.box, np.arange(len(wanted) + 1))
+    rows_of = {
+        box: np.arange(first[box], first[box + 1]) for box in np.flatnonzero(poor) if first[box] < first[box + 1]
+    }
+    for box in sorted(rows_of, key=lambda box: -merit[rows_of[box]].max()):
+        rows = rows_of[box][owner[pairs.anchor[rows_of[box]]] < 0]
+        if len(rows):
+            owner[pairs.anchor[rows[merit[rows].argmax()]]] = box
 
 
 def _half_turn(angle: FloatArray) -> FloatArray:

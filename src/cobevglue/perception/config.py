@@ -101,7 +101,7 @@ class PointPillarsConfig(Settings):
         Anchor(length=9.0, width=2.6, height=3.3, z=-0.2),
     )
     positive_iou: _Share = 0.5
-    negative_iou: _Share = 0.35
+    negative_iou: _Share = 0.45
     ignore_iou: _Share = 0.2
     detection: DetectionConfig = DetectionConfig()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -174,9 +175,11 @@ class PointPillars(nn.Module):
         """
         shape = 1, self.config.pillar_channels, self.config.rows, self.config.columns
         names = list(HeadOutput._fields)
-        with self._evaluating():
+        with self._evaluating(), warnings.catch_warnings():
+            # The exporter that takes this one's place needs onnxscript, for the same graph.
+            warnings.simplefilter("ignore", DeprecationWarning)
             torch.onnx.export(
-                _BehindPillars(self),
+                _BehindPillars(self).eval(),
                 (torch.zeros(shape, device=self.device),),
                 str(path),
                 input_names=["image"],
