@@ -53,7 +53,7 @@ class LossConfig(Settings):
 
     classification: _Weight = 1.0
     box: _Weight = 2.0
-    direction: _Weight = 0.2
+    direction: _Weight = 0.4
     uncertainty: _Weight = 0.25
     alpha: Annotated[float, Field(gt=0, lt=1)] = 0.25
     gamma: _Weight = 2.0

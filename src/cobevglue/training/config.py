@@ -116,10 +116,11 @@ FREE_TO_CHANGE = {"device", "threads", "report_every", "init_from"}
 
 PRESETS: dict[str, TrainDetectorConfig] = {
     # As many samples as two cores get through in about an hour and a half. What an agent sees lies along its road, so
-    # scenes are turned by no more than roads are.
+    # scenes are turned by no more than roads are, and not mirrored: which side traffic keeps to says which way a far
+    # vehicle faces.
     "compact": TrainDetectorConfig(
         data=DataConfig(min_points=2),
-        augmentation=AugmentationConfig(rotation=0.4),
+        augmentation=AugmentationConfig(mirror=0.0, rotation=0.4),
         optimisation=OptimisationConfig(epochs=24, samples_per_epoch=500),
         validation=ValidationConfig(every=5, episodes=8),
     ),
