@@ -9,12 +9,19 @@ Everything is right-handed (x forward, y left, z up) whatever the files are, and
 """
 
 from cobevglue.datasets.dair_v2x import DAIRV2X
+from cobevglue.datasets.dair_v2x_writer import (
+    DAIRPair,
+    DAIRSide,
+    write_dair_v2x_frame,
+    write_dair_v2x_index,
+)
 from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario
 from cobevglue.datasets.opv2v import OPV2V, V2XSet
 from cobevglue.datasets.opv2v_writer import write_opv2v_frame
 from cobevglue.datasets.pcd import read_pcd
 from cobevglue.datasets.poses import transform_boxes
 from cobevglue.datasets.v2v4real import V2V4Real
+from cobevglue.datasets.v2v4real_writer import write_v2v4real_frame
 
 DATASETS: dict[str, type[Dataset]] = {"opv2v": OPV2V, "v2xset": V2XSet, "v2v4real": V2V4Real, "dair-v2x": DAIRV2X}
 """Data sets by the name that users type; each is made from (root, split)."""
@@ -24,6 +31,8 @@ __all__ = [
     "DATASETS",
     "OPV2V",
     "AgentFrame",
+    "DAIRPair",
+    "DAIRSide",
     "Dataset",
     "Frame",
     "Scenario",
@@ -31,5 +40,8 @@ __all__ = [
     "V2XSet",
     "read_pcd",
     "transform_boxes",
+    "write_dair_v2x_frame",
+    "write_dair_v2x_index",
     "write_opv2v_frame",
+    "write_v2v4real_frame",
 ]

@@ -12,6 +12,7 @@ import yaml
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.pcd import write_pcd_rgb
 from cobevglue.datasets.poses import carla_from_SE3, rigid_SE3
+from cobevglue.datasets.whole_files import whole_file
 from cobevglue.typing import ArrayLike
 
 __all__ = ["write_opv2v_frame"]
@@ -32,11 +33,13 @@ def write_opv2v_frame(
     speeds: Mapping[int, float] | None = None,
     ego_speed: float = 0.0,
     world_SE3_vehicle: ArrayLike | None = None,
+    point_counts: Mapping[int, int] | None = None,
 ) -> None:
-    """Write what one agent had at one time: `<timestamp>.yaml`, and `<timestamp>.pcd` if there is a cloud.
+    """Write what one agent had at one time: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
 
     The inverse of reading: `OPV2V` gives back pose and objects to the precision of floats, points exactly and
-    intensities to 8 bits. Axes are mirrored to OPV2V's left-handed ones. Labels are kept under `obj_type`.
+    intensities to 8 bits. Axes are mirrored to OPV2V's left-handed ones. Labels are kept under `obj_type`. A file is
+    there complete or not at all.
 
     Args:
         agent_folder: `<root>/<split>/<scenario>/<agent>`; made if it is not there. Roadside units have negative names.
@@ -47,6 +50,7 @@ def write_opv2v_frame(
         speeds: km/h of objects by id; 0 where left out.
         ego_speed: km/h of the agent.
         world_SE3_vehicle: (4, 4) right-handed pose of the vehicle on the ground; that of the LiDAR where left out.
+        point_counts: how many of the cloud's points lie on objects, by id; kept under `points`, which OPV2V has not.
 
     Raises:
         ValueError: a pose is not rigid, the timestamp is not a number, objects have no ids, or points are malformed.
@@ -71,6 +75,8 @@ def write_opv2v_frame(
         }
         if objects.label is not None:
             vehicles[track_id]["obj_type"] = str(objects.label[row])
+        if point_counts is not None and track_id in point_counts:
+            vehicles[track_id]["points"] = int(point_counts[track_id])
     document = {
         "ego_speed": float(ego_speed),
         "lidar_pose": carla_from_SE3(lidar).tolist(),
@@ -79,10 +85,9 @@ def write_opv2v_frame(
         "vehicles": vehicles,
     }
     folder = Path(agent_folder)
-    folder.mkdir(parents=True, exist_ok=True)
     if points is not None:
         write_pcd_rgb(folder / f"{timestamp}.pcd", points)
-    with (folder / f"{timestamp}.yaml").open("w", encoding="utf-8") as file:
+    with whole_file(folder / f"{timestamp}.yaml") as path, path.open("w", encoding="utf-8") as file:
         yaml.dump(document, file, Dumper=_SafeDumper)
 
 

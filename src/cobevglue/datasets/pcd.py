@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cobevglue.datasets.whole_files import whole_file
 from cobevglue.typing import ArrayLike, Float32Array
 
-__all__ = ["read_pcd", "write_pcd_rgb"]
+__all__ = ["read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
 
 
 def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
@@ -53,26 +55,53 @@ def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0
     return points[np.isfinite(points).all(axis=1)]
 
 
-def write_pcd_rgb(path: Path, points: ArrayLike) -> None:
-    """Write a cloud the way OPV2V stores it: binary PCD, y to the right, the intensity in the red byte of `rgb`.
+def write_pcd_rgb(path: Path, points: ArrayLike, left_handed: bool = True) -> None:
+    """Write a cloud the way OPV2V stores it: binary PCD, the intensity in the red byte of `rgb`.
 
     Args:
-        path: the file; an existing one is replaced.
+        path: the file; an existing one is replaced, when all is written.
         points: (N, 4) x, y, z [m], y to the left, and intensity in [0, 1], of which 8 bits are kept.
+        left_handed: the file has y to the right, as OPV2V's: mirror the points.
 
     Raises:
         ValueError: the points have another shape, are not finite, or an intensity is not in [0, 1].
     """
-    from pypcd4.pypcd4 import Encoding, PointCloud  # imported here: it takes longer than the rest of the package
+    cloud, level = _checked_cloud(points)
+    red = level.astype(np.uint32) << 16
+    side = -cloud[:, 1] if left_handed else cloud[:, 1]
+    _write(path, ("x", "y", "z", "rgb"), [cloud[:, 0], side, cloud[:, 2], red.view(np.float32)])
 
+
+def write_pcd_intensity(path: Path, points: ArrayLike) -> None:
+    """Write a cloud the way a real sensor's is stored: binary PCD, y to the left, `intensity` from 0 to 255.
+
+    Args:
+        path: the file; an existing one is replaced, when all is written.
+        points: (N, 4) x, y, z [m] and intensity in [0, 1], of which 8 bits are kept.
+
+    Raises:
+        ValueError: the points have another shape, are not finite, or an intensity is not in [0, 1].
+    """
+    cloud, level = _checked_cloud(points)
+    _write(path, ("x", "y", "z", "intensity"), [*cloud[:, :3].T, level])
+
+
+def _checked_cloud(points: ArrayLike) -> tuple[Float32Array, Float32Array]:
+    """The cloud, and its (N,) intensities as whole numbers from 0 to 255."""
     cloud = np.asarray(points, dtype=np.float32)
     if cloud.ndim != 2 or cloud.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4), got {cloud.shape}")
     if not np.isfinite(cloud).all() or (cloud[:, 3] < 0).any() or (cloud[:, 3] > 1).any():
         raise ValueError("points must be finite with intensities in [0, 1]")
-    red = np.rint(cloud[:, 3] * 255.0).astype(np.uint32) << 16
-    columns = [cloud[:, 0], -cloud[:, 1], cloud[:, 2], red.view(np.float32)]
-    PointCloud.from_points(columns, ("x", "y", "z", "rgb"), (np.float32,) * 4).save(path, encoding=Encoding.BINARY)
+    return cloud, np.rint(cloud[:, 3] * np.float32(255.0))
+
+
+def _write(path: Path, fields: Sequence[str], columns: Sequence[Float32Array]) -> None:
+    from pypcd4.pypcd4 import Encoding, PointCloud  # imported here: it takes longer than the rest of the package
+
+    cloud = PointCloud.from_points(list(columns), fields, (np.float32,) * len(fields))
+    with whole_file(path) as partial:
+        cloud.save(partial, encoding=Encoding.BINARY)
 
 
 def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:

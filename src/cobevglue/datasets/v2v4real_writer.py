@@ -1,0 +1,91 @@
+"""Writes frames in V2V4Real's own layout, so that whatever reads V2V4Real reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.pcd import write_pcd_rgb
+from cobevglue.datasets.poses import mirrored, rigid_SE3
+from cobevglue.datasets.v2v4real import LEFT_HANDED
+from cobevglue.datasets.whole_files import whole_file
+from cobevglue.typing import ArrayLike
+
+__all__ = ["write_v2v4real_frame"]
+
+try:
+    from yaml import CDumper as _Dumper
+except ImportError:  # PyYAML built without libyaml
+    from yaml import Dumper as _Dumper  # type: ignore[assignment]
+
+AGENTS = ("0", "1")
+"""Names of the two cars."""
+
+
+def write_v2v4real_frame(
+    agent_folder: str | Path,
+    timestamp: str,
+    world_SE3_lidar: ArrayLike,
+    objects: Boxes,
+    points: ArrayLike | None = None,
+    *,
+    speeds: Mapping[int, float] | None = None,
+    left_handed: bool = LEFT_HANDED,
+) -> None:
+    """Write what one car had at one time: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
+
+    The inverse of reading: `V2V4Real` gives back pose and objects to the precision of floats, points exactly and
+    intensities to 8 bits. All objects are associated: `ass_id` is the `track_id`. The pose is dumped as a numpy array,
+    which other tools of this data set rely on. A file is there complete or not at all.
+
+    Args:
+        agent_folder: `<root>/<split>/<scenario>/<agent>`, the agent "0" or "1"; made if it is not there.
+        timestamp: file number as text, digits only; frames 0.1 s apart are numbered 1 apart.
+        world_SE3_lidar: (4, 4) right-handed pose of the LiDAR.
+        objects: the objects that the car could see, in its LiDAR frame, with `track_id` >= 0. Labels are kept under
+            `obj_type`, in capitals; reading makes them lower-case, and "Car" stands where there are none.
+        points: (N, 4) x, y, z [m], intensity [0, 1] in the LiDAR frame; None to store no cloud.
+        speeds: km/h of objects by id; 0 where left out.
+        left_handed: write files with y to the right, to be read with the same option.
+
+    Raises:
+        ValueError: the pose is not rigid, the agent is not "0" or "1", the timestamp is not a number, objects have no
+            ids or negative ones, or points are malformed.
+    """
+    folder = Path(agent_folder)
+    if folder.name not in AGENTS:
+        raise ValueError(f"agents of V2V4Real are called 0 and 1, got {folder.name!r}")
+    if not (timestamp.isascii() and timestamp.isdigit()):
+        raise ValueError(f"timestamp must be digits, like '000068', got {timestamp!r}")
+    if objects.track_id is None or (objects.track_id < 0).any():
+        raise ValueError("objects must have a track_id, >= 0")
+    try:
+        pose = rigid_SE3(world_SE3_lidar)
+    except ValueError as error:
+        raise ValueError(f"world_SE3_lidar {error}") from None
+    center, yaw = objects.center, np.rad2deg(objects.yaw)
+    if left_handed:
+        pose, center, yaw = mirrored(pose), center * [1.0, -1.0, 1.0], -yaw
+    vehicles: dict[int, dict[str, Any]] = {}
+    for row, track_id in enumerate(objects.track_id.tolist()):
+        vehicles[track_id] = {
+            "angle": [0.0, float(yaw[row]), 0.0],
+            "ass_id": track_id,
+            "center": [0.0, 0.0, 0.0],
+            "extent": (objects.size[row] / 2).tolist(),
+            "location": center[row].tolist(),
+            "obj_type": "Car" if objects.label is None else str(objects.label[row]).capitalize(),
+            "speed": float((speeds or {}).get(track_id, 0.0)),
+        }
+    document = {"lidar_pose": pose, "true_ego_pos": pose.copy(), "vehicles": vehicles}
+    # Users of this data set have numpy 1, whose name for the helper numpy 2 knows as well.
+    text = yaml.dump(document, Dumper=_Dumper).replace("numpy._core.", "numpy.core.")
+    if points is not None:
+        write_pcd_rgb(folder / f"{timestamp}.pcd", points, left_handed=left_handed)
+    with whole_file(folder / f"{timestamp}.yaml") as path:
+        path.write_text(text, encoding="utf-8")
