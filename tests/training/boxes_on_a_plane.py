@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +21,7 @@ class BoxesOnAPlane:
     ground_points: int = 600
     points_on_car: int = 60
 
-    def episode(self, index: int) -> Sequence[Sample]:
+    def episode(self, index: int) -> list[Sample]:
         random = np.random.default_rng([self.seed, index])
         return [self._sample(random) for _ in range(self.samples)]
 

@@ -149,6 +149,9 @@ class _Run:
             self.optimizer.load_state_dict(state.optimizer)
             self.epoch, self.elapsed, self.best = state.epoch, state.elapsed, state.best
         self.net = self._distributed()
+        if processes.device.type == "cuda":
+            # Clouds become images of one size, so the fastest kernels need to be looked for only once.
+            torch.backends.cudnn.benchmark = True
 
     def train(
         self, source: EpisodeSource, validation_source: EpisodeSource | None, max_minutes: float | None
@@ -207,6 +210,7 @@ class _Run:
                 collate_fn=ready.collate,
                 prefetch_factor=4 if workers else None,
                 pin_memory=self.processes.device.type == "cuda",
+                generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
             )
         )
 

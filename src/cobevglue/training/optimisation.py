@@ -37,8 +37,8 @@ class OptimisationConfig(Settings):
             factor a step (faster in the first steps); 0 takes the last weights.
     """
 
-    epochs: Annotated[int, Field(ge=1)] = 40
-    samples_per_epoch: Annotated[int, Field(ge=1)] = 4000
+    epochs: Annotated[int, Field(ge=1)] = 30
+    samples_per_epoch: Annotated[int, Field(ge=1)] = 1000
     batch_size: Annotated[int, Field(ge=1)] = 4
     learning_rate: _Positive = 2e-3
     start: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1

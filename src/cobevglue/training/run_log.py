@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
 __all__ = ["RunLog", "print_progress"]
 
@@ -27,13 +27,17 @@ class RunLog:
 
         Args:
             folder: of the run.
-            from_step: where a resumed run goes on; TensorBoard then forgets what an earlier try logged beyond.
+            from_step: where a resumed run goes on: what an earlier try logged beyond is forgotten. 0 starts anew.
             write: False for a log of nothing: one process writes for all.
         """
-        self._lines = (folder / "log.jsonl").open("a", encoding="utf-8") if write else None
+        self._lines: TextIO | None = None
         self._events: Any = None
         if not write:
             return
+        path = folder / "log.jsonl"
+        kept = [line for line in _complete_lines(path) if json.loads(line)["step"] <= from_step]
+        self._lines = path.open("w", encoding="utf-8")
+        self._lines.writelines(kept if from_step else [])
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
@@ -62,3 +66,9 @@ class RunLog:
         if self._events is not None:
             for name, value in values.items():
                 self._events.add_scalar(f"{group}/{name}", value, step)
+
+
+def _complete_lines(path: Path) -> list[str]:
+    """Those of an earlier try; one that was cut off while writing is left out."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
+    return [line for line in lines if line.endswith("}\n")]

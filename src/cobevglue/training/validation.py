@@ -62,6 +62,7 @@ class Validation:
             batch_size=config.optimisation.batch_size,
             num_workers=config.data.workers,
             collate_fn=batches.collate,
+            generator=torch.Generator(),  # see `_Run._batches`
         )
         return list(loader)
 
