@@ -1,0 +1,56 @@
+"""Equation (1a): points in, features and tracked boxes out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cobevglue.perception import Perception, PointPillars
+
+from .conftest import OBJECTS, cloud_of
+
+
+def test_objects_keep_their_identity_over_frames(trained: PointPillars) -> None:
+    perception = Perception(trained, min_track_score=0.5)
+    ids = []
+    for frame in range(4):
+        cloud = cloud_of(OBJECTS)
+        cloud[:, 0] += 0.05 * frame  # the vehicle drives
+        out = perception.step(cloud, time=0.1 * frame)
+        order = np.lexsort(np.round(out.boxes.center[:, :2]).T)
+        assert out.boxes.track_id is not None
+        ids.append(out.boxes.track_id[order].tolist())
+    assert ids == [ids[0]] * 4
+    assert len(set(ids[0])) == 4
+
+
+def test_what_comes_out_belongs_together(trained: PointPillars) -> None:
+    out = Perception(trained).step(cloud_of(OBJECTS))
+    assert [tuple(f.shape) for f in out.features] == [(12, 24, 32), (16, 12, 16), (24, 6, 8)]
+    assert out.variance.shape == (len(out.boxes), 3)
+    assert list(out.seconds) == ["pillars", "backbone", "head", "boxes", "tracking"]
+    assert out.boxes.score is not None
+    assert out.detections.score is not None
+    assert out.detections.track_id is None
+    assert out.boxes.score.tolist() == [s for s in out.detections.score if s >= 0.25]
+
+
+def test_after_a_reset_time_and_tracks_start_again(trained: PointPillars) -> None:
+    perception = Perception(trained)
+    perception.step(cloud_of(OBJECTS), time=5.0)
+    with pytest.raises(ValueError, match="time"):
+        perception.step(cloud_of(OBJECTS), time=1.0)
+    perception.reset()
+    perception.step(cloud_of(OBJECTS), time=1.0)
+
+
+def test_an_empty_frame_is_a_frame(trained: PointPillars) -> None:
+    out = Perception(trained, min_track_score=0.5).step(np.zeros((0, 4)))
+    assert len(out.boxes) == 0
+    assert out.boxes.track_id is not None
+
+
+@pytest.mark.parametrize("score", [-0.1, 1.1, float("nan")])
+def test_a_threshold_is_a_score(trained: PointPillars, score: float) -> None:
+    with pytest.raises(ValueError, match="min_track_score"):
+        Perception(trained, min_track_score=score)
