@@ -27,7 +27,7 @@ import torch
 
 from cobevglue import BEVGlue
 from cobevglue.datasets import OPV2V
-from cobevglue.evaluation.alignment import evaluate, summarise
+from cobevglue.evaluation.alignment import AlignmentSequence, evaluate, summarise
 from cobevglue.evaluation.alignment_data import perceived_sequences
 from cobevglue.evaluation.detection import DetectionReport, evaluate_detections
 from cobevglue.evaluation.detection_data import dataset_clouds, detect, simulated_clouds
@@ -71,9 +71,14 @@ def real(detector: PointPillars, data: Path) -> None:
     show(f"OPV2V {SCENARIO}, {len(frames)} clouds, range {RANGE}", evaluate_detections(frames, evaluation_range=RANGE))
     failures = [f for frame in frames for f in find_failures(frame, threshold=0.7, evaluation_range=RANGE)]
     print("\n| failure at IoU 0.7 | points on it | count |\n|---|---|---|")
-    kinds = Counter((f.kind, "0-9" if f.points < 10 else "10-49" if f.points < 50 else "50-") for f in failures)
+    kinds = Counter((failure.kind, points_bin(failure.points or 0)) for failure in failures)
     for (kind, points), count in sorted(kinds.items()):
         print(f"| {kind} | {points} | {count} |")
+
+
+def points_bin(points: int) -> str:
+    """Which row of the table."""
+    return "0-9" if points < 10 else "10-49" if points < 50 else "50-"
 
 
 def simulated(detector: PointPillars, split: str, count: int) -> None:
@@ -104,7 +109,9 @@ def alignment(detector: PointPillars, data: Path) -> None:
     (sequence,) = perceived_sequences(scenarios, lambda: Perception(detector))
     print("| | frames | accepted | wrong (>= 3 m) | median error [m] | [deg] | largest [m] | co-visible |")
     print("|---|---|---|---|---|---|---|---|")
-    alone = [record for frame in sequence.frames for record in evaluate([_only(sequence.name, frame)], BEVGlue)]
+    alone = [
+        record for frame in sequence.frames for record in evaluate([AlignmentSequence(sequence.name, [frame])], BEVGlue)
+    ]
     for name, records in (("over time", list(evaluate([sequence], BEVGlue))), ("single frames", alone)):
         accepted = [record for record in records if record.accepted]
         errors = [record.translation_error for record in accepted] or [float("nan")]
@@ -116,13 +123,6 @@ def alignment(detector: PointPillars, data: Path) -> None:
             f"| {max(errors):.2f} | {seen:.0f} |"
         )
         print(f"  match precision {summarise(records).match_precision:.3f}")
-
-
-def _only(name: str, frame: object) -> object:
-    from cobevglue.evaluation.alignment import AlignmentSequence, PairFrame
-
-    assert isinstance(frame, PairFrame)
-    return AlignmentSequence(name, [frame])
 
 
 def speed(detector: PointPillars, data: Path) -> None:

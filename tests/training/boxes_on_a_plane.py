@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cobevglue import Boxes
-from cobevglue.training.samples import Sample, count_points
+from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class BoxesOnAPlane:
     ground_points: int = 600
     points_on_car: int = 60
 
-    def episode(self, index: int) -> list[Sample]:
+    def episode(self, index: int) -> list[LabelledCloud]:
         random = np.random.default_rng([self.seed, index])
         return [self._sample(random) for _ in range(self.samples)]
 
-    def _sample(self, random: np.random.Generator) -> Sample:
+    def _sample(self, random: np.random.Generator) -> LabelledCloud:
         n, reach = self.cars, self.reach
         xy = random.uniform(-reach, reach, (n, 2))
         boxes = Boxes(
@@ -44,4 +44,4 @@ class BoxesOnAPlane:
         )
         xyz = np.concatenate([on_cars.reshape(-1, 3), ground])
         points = np.column_stack([xyz, random.random(len(xyz))]).astype(np.float32)
-        return Sample(points, boxes, count_points(points, boxes))
+        return LabelledCloud(points, boxes, count_points(points, boxes))

@@ -7,15 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from cobevglue.training import AugmentationConfig, Sample, augment, count_points
+from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
+from cobevglue.training import AugmentationConfig, augment
 
 from .boxes_on_a_plane import BoxesOnAPlane
 
 NOTHING = {"mirror": 0.0, "rotation": 0.0, "scaling": 0.0, "z_shift": 0.0, "drop": 0.0}
-SAMPLE: Sample = BoxesOnAPlane(seed=5).episode(0)[0]
+SAMPLE: LabelledCloud = BoxesOnAPlane(seed=5).episode(0)[0]
 
 
-def changed(**settings: float) -> Sample:
+def changed(**settings: float) -> LabelledCloud:
     return augment(SAMPLE, AugmentationConfig(**{**NOTHING, **settings}), np.random.default_rng(1))
 
 

@@ -13,7 +13,8 @@ from cobevglue.cli import main
 
 pytest.importorskip("torch")
 
-from cobevglue.training import Sample, detector
+from cobevglue.datasets.labelled_cloud import LabelledCloud
+from cobevglue.training import detector
 
 from .boxes_on_a_plane import BoxesOnAPlane
 from .small import SMALL
@@ -69,7 +70,7 @@ def test_an_interrupted_run_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Interrupted(BoxesOnAPlane):
-        def episode(self, index: int) -> list[Sample]:
+        def episode(self, index: int) -> list[LabelledCloud]:
             if index >= 8:  # of the second epoch
                 raise KeyboardInterrupt
             return super().episode(index)

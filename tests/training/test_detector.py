@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 import torch
 
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.perception import PointPillars
-from cobevglue.training import Sample, TrainDetectorConfig, TrainingResult, train_detector
+from cobevglue.training import TrainDetectorConfig, TrainingResult, train_detector
 from cobevglue.training.checkpoint import load_state
 
 from .boxes_on_a_plane import BoxesOnAPlane
@@ -74,7 +75,7 @@ class Interrupted:
 
     first_of_second: int = 8
 
-    def episode(self, index: int) -> Sequence[Sample]:
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
         if index >= self.first_of_second:
             raise KeyboardInterrupt
         return SOURCE.episode(index)

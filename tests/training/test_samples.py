@@ -1,50 +1,15 @@
-"""Samples: points in boxes, and episodes of a data set."""
+"""Episodes of a data set."""
 
 from __future__ import annotations
 
-import math
 import pickle
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from cobevglue import Boxes
 from cobevglue.datasets import AgentFrame, Dataset, Frame, Scenario
-from cobevglue.training import DatasetEpisodes, Sample, count_points
-
-
-@pytest.mark.parametrize(
-    ("point", "size", "yaw", "count"),
-    [
-        ((10.0, 0.0, 0.0), (4, 2, 1.5), 0.0, 1),  # the centre
-        ((12.0, 1.0, 0.75), (4, 2, 1.5), 0.0, 1),  # a corner belongs to the box
-        ((12.1, 0.0, 0.0), (4, 2, 1.5), 0.0, 0),  # ahead of it
-        ((10.0, 1.1, 0.0), (4, 2, 1.5), 0.0, 0),  # beside it
-        ((10.0, 0.0, 0.8), (4, 2, 1.5), 0.0, 0),  # above it
-        ((10.0, 1.9, 0.0), (4, 2, 1.5), math.pi / 2, 1),  # beside it, but it stands across
-        ((11.9, 0.0, 0.0), (4, 2, 1.5), math.pi / 2, 0),  # ahead of it, but it stands across
-        ((10.0, 0.0, 9.0), (4, 2, 0), 0.0, 1),  # a box of unknown height is as high as you like
-    ],
-)
-def test_points_in_a_box(
-    point: tuple[float, float, float], size: tuple[float, float, float], yaw: float, count: int
-) -> None:
-    points = np.array([[-50, 0, 0, 0], [*point, 0.5], [50, 0, 0, 0]], dtype=np.float32)
-    assert count_points(points, Boxes([(10, 0, 0)], [size], [yaw])).tolist() == [count]
-
-
-def test_no_points_and_no_boxes() -> None:
-    nothing = np.zeros((0, 4), dtype=np.float32)
-    assert count_points(nothing, Boxes([(0, 0, 0)], [(4, 2, 1)], [0])).tolist() == [0]
-    assert count_points(nothing, Boxes.empty()).shape == (0,)
-
-
-def test_a_sample_refuses_what_does_not_fit() -> None:
-    with pytest.raises(ValueError, match="points must have shape"):
-        Sample(np.zeros((3, 3), dtype=np.float32), Boxes.empty(), np.zeros(0, dtype=np.int64))
-    with pytest.raises(ValueError, match="point_count must have shape"):
-        Sample(np.zeros((3, 4), dtype=np.float32), Boxes.empty(), np.zeros(1, dtype=np.int64))
+from cobevglue.training import DatasetEpisodes
 
 
 class Numbered(Dataset):

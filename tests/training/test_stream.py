@@ -10,7 +10,7 @@ import pytest
 from torch.utils.data import DataLoader
 
 from cobevglue import Boxes
-from cobevglue.training.samples import Sample, SampleLike
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.training.stream import EpisodeStream, FixedStream
 
 
@@ -20,12 +20,12 @@ class Numbers:
 
     size: int = 3
 
-    def episode(self, index: int) -> Sequence[Sample]:
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
         points = [np.array([[index, j, 0, 0]], dtype=np.float32) for j in range(self.size)]
-        return [Sample(p, Boxes.empty(), np.zeros(0, dtype=np.int64)) for p in points]
+        return [LabelledCloud(p, Boxes.empty(), np.zeros(0, dtype=np.int64)) for p in points]
 
 
-def tell(sample: SampleLike, random: np.random.Generator) -> tuple[int, int, float]:
+def tell(sample: LabelledCloud, random: np.random.Generator) -> tuple[int, int, float]:
     """Episode, number, and a random number as augmentation would draw one."""
     return int(sample.points[0, 0]), int(sample.points[0, 1]), float(random.random())
 

@@ -11,16 +11,24 @@ from cobevglue.cli.output import print_json, print_note, print_table
 __all__ = ["bench"]
 
 
-def bench(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False) -> None:
+def bench(
+    threads: Annotated[int, typer.Option(min=1, help="Of the detector's network.")] = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
     """Measure the speed of each step, and the size of messages, over object counts.
 
     Best and median of repeated frames of two agents that share 60 % of their objects; compilation is not counted. A
-    first frame is searched without knowing anything; later frames use what was found before.
+    first frame is searched without knowing anything; later frames use what was found before. Perception, from a stored
+    cloud to tracked boxes, is measured where torch and the simulation are installed.
     """
     print_note("the first run compiles for some seconds …")
     from cobevglue.cli.measure import OBJECT_COUNTS, STEPS, measure
+    from cobevglue.cli.measure_perception import measure_perception
 
+    print_note("perception …")
+    perception = measure_perception(threads)
     report = measure(lambda count: print_note(f"{count} objects …"))
+    report["perception"] = perception
     if as_json:
         print_json(report)
         return
@@ -34,6 +42,14 @@ def bench(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON d
     print_table("Time of each step for one frame", header, rows)
     sizes = ("message", *(str(report["message_bytes"][str(count)]) for count in OBJECT_COUNTS))
     print_table("Size", ("bytes", *header[1:]), [sizes])
+    if perception is None:
+        print_note("perception is left out: pip install 'cobevglue[perception,simulation]'")
+    else:
+        stages = [(name, f"{t['median_ms']:.1f}", f"{t['best_ms']:.1f}") for name, t in perception["stages"].items()]
+        title = f"One cloud of {perception['points']} points, weights compact, {perception['threads']} threads"
+        print_table(title, ("stage, milliseconds", "median", "best"), stages)
+        if perception["largest_memory_mb"] is not None:
+            print(f"largest memory of the process up to here: {perception['largest_memory_mb']:.0f} MB")
     machine = report["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     print(f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; {versions}")

@@ -10,11 +10,11 @@ import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.datasets import Dataset
+from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
 from cobevglue.evaluation.detection_matching import DetectionFrame
-from cobevglue.training.samples import count_points
 from cobevglue.typing import Float32Array, IntArray
 
-__all__ = ["Cloud", "Detector", "Episodes", "LabelledCloud", "dataset_clouds", "detect", "simulated_clouds"]
+__all__ = ["Cloud", "Detector", "Episodes", "dataset_clouds", "detect", "simulated_clouds"]
 
 
 class Detector(Protocol):
@@ -23,17 +23,6 @@ class Detector(Protocol):
     def detect(self, points: Float32Array, /) -> Boxes:
         """Boxes with scores in the frame of the points (N, 4)."""
         ...
-
-
-class LabelledCloud(Protocol):
-    """One cloud (N, 4), the K objects in it in the sensor's frame, and the (K,) points on each."""
-
-    @property
-    def points(self) -> Float32Array: ...  # noqa: D102
-    @property
-    def boxes(self) -> Boxes: ...  # noqa: D102
-    @property
-    def point_count(self) -> IntArray: ...  # noqa: D102
 
 
 class Episodes(Protocol):

@@ -9,33 +9,18 @@ import numpy as np
 from pydantic import Field
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.settings import Settings
 from cobevglue.simulation.lidar import LIDARS, LidarSettings
 from cobevglue.simulation.road_network import NETWORKS
 from cobevglue.simulation.traffic import Traffic
 from cobevglue.simulation.world import LidarView, World
-from cobevglue.typing import Float32Array, IntArray
 
-__all__ = ["EpisodeSettings", "LabelledCloud", "SimulatedEpisodes"]
+__all__ = ["EpisodeSettings", "SimulatedEpisodes"]
 
 _EPISODE_STREAM = 30
 _AGENT_KINDS = ("sedan", "hatchback", "coupe", "suv")
 """What may carry a sensor: it stands 1.9 m high, above the roof."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class LabelledCloud:
-    """One cloud and the objects in it, in the sensor's frame.
-
-    Attributes:
-        points: (N, 4) float32 x, y, z [m] and intensity.
-        boxes: K objects that at least one point lies on.
-        point_count: (K,) how many points lie on each.
-    """
-
-    points: Float32Array
-    boxes: Boxes
-    point_count: IntArray
 
 
 class EpisodeSettings(Settings):

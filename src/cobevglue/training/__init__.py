@@ -10,7 +10,7 @@ from cobevglue.training.augmentation import AugmentationConfig, augment
 from cobevglue.training.config import PRESETS, DataConfig, TrainDetectorConfig, ValidationConfig, load_config
 from cobevglue.training.detector import DivergedError, TrainingResult, train_detector
 from cobevglue.training.optimisation import OptimisationConfig
-from cobevglue.training.samples import DatasetEpisodes, EpisodeSource, Sample, SampleLike, count_points
+from cobevglue.training.samples import DatasetEpisodes, EpisodeSource
 
 __all__ = [
     "PRESETS",
@@ -20,13 +20,10 @@ __all__ = [
     "DivergedError",
     "EpisodeSource",
     "OptimisationConfig",
-    "Sample",
-    "SampleLike",
     "TrainDetectorConfig",
     "TrainingResult",
     "ValidationConfig",
     "augment",
-    "count_points",
     "load_config",
     "train_detector",
 ]

@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.settings import Settings
-from cobevglue.training.samples import Sample, SampleLike
 
 __all__ = ["AugmentationConfig", "augment"]
 
@@ -37,7 +37,7 @@ class AugmentationConfig(Settings):
     min_keep: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
 
 
-def augment(sample: SampleLike, config: AugmentationConfig, random: np.random.Generator) -> Sample:
+def augment(sample: LabelledCloud, config: AugmentationConfig, random: np.random.Generator) -> LabelledCloud:
     """A changed copy of a sample.
 
     Args:
@@ -73,4 +73,4 @@ def augment(sample: SampleLike, config: AugmentationConfig, random: np.random.Ge
         size=sample.boxes.size * scale,
         yaw=sample.boxes.yaw * side + angle,
     )
-    return Sample(moved, boxes, point_count)
+    return LabelledCloud(moved, boxes, point_count)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.perception import AnchorGrid, PointPillarsConfig, TargetBatch, Targets, assign_targets, collate_targets
 from cobevglue.training.augmentation import AugmentationConfig, augment
-from cobevglue.training.samples import SampleLike
 from cobevglue.typing import BoolArray, Float32Array, FloatArray, IntArray
 
 __all__ = ["Batch", "Batches", "Item"]
@@ -74,7 +74,7 @@ class Batches:
         self._model, self._min_points, self._augmentation = model, min_points, augmentation
         self._anchors = AnchorGrid(model)
 
-    def prepare(self, sample: SampleLike, random: np.random.Generator) -> Item:
+    def prepare(self, sample: LabelledCloud, random: np.random.Generator) -> Item:
         """The sample, augmented and cropped, with targets."""
         if self._augmentation is not None:
             sample = augment(sample, self._augmentation, random)

@@ -1,68 +1,24 @@
-"""What a detector is trained on: clouds with the boxes in them, and where they come from."""
+"""Where clouds to train on come from."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from cobevglue.boxes import Boxes
 from cobevglue.datasets import Dataset
-from cobevglue.typing import Float32Array, IntArray
+from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
+from cobevglue.typing import IntArray
 
-__all__ = ["DatasetEpisodes", "EpisodeSource", "Sample", "SampleLike", "count_points"]
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One cloud and the objects in it.
-
-    Attributes:
-        points: (N, 4) x, y, z [m] and intensity [0, 1] in the sensor's frame.
-        boxes: K objects in the same frame.
-        point_count: (K,) points on each object.
-
-    Raises:
-        ValueError: a wrong shape.
-    """
-
-    points: Float32Array
-    boxes: Boxes
-    point_count: IntArray
-
-    def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 4:
-            raise ValueError(f"points must have shape (N, 4), got {self.points.shape}")
-        if self.point_count.shape != (len(self.boxes),):
-            raise ValueError(f"point_count must have shape ({len(self.boxes)},), got {self.point_count.shape}")
-
-
-class SampleLike(Protocol):
-    """Anything with the attributes of a `Sample`; the simulator has a class of its own."""
-
-    @property
-    def points(self) -> Float32Array:
-        """(N, 4)."""
-        ...
-
-    @property
-    def boxes(self) -> Boxes:
-        """K objects."""
-        ...
-
-    @property
-    def point_count(self) -> IntArray:
-        """(K,)."""
-        ...
+__all__ = ["DatasetEpisodes", "EpisodeSource"]
 
 
 class EpisodeSource(Protocol):
     """Where samples come from. It is copied into worker processes, so it must be picklable."""
 
-    def episode(self, index: int) -> Sequence[SampleLike]:
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
         """A few samples that are cheap to make together: snapshots of one simulated world, some frames of a data set.
 
         Args:
@@ -102,7 +58,7 @@ class DatasetEpisodes:
         """Episodes of one pass over the data set; a last incomplete one is left out."""
         return len(self._frames) // self._frames_per_episode
 
-    def episode(self, index: int) -> Sequence[Sample]:
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
         """The samples of episode `index`; see `EpisodeSource`.
 
         Raises:
@@ -114,38 +70,10 @@ class DatasetEpisodes:
         chosen = self._pass[1][position * self._frames_per_episode : (position + 1) * self._frames_per_episode]
         return list(itertools.chain.from_iterable(self._samples(*self._frames[row]) for row in chosen))
 
-    def _samples(self, scenario: str, number: int) -> list[Sample]:
+    def _samples(self, scenario: str, number: int) -> list[LabelledCloud]:
         agents = self._dataset[scenario][number].agents.values()
         return [
-            Sample(agent.points, agent.objects, count_points(agent.points, agent.objects))
+            LabelledCloud(agent.points, agent.objects, count_points(agent.points, agent.objects))
             for agent in agents
             if agent.points is not None
         ]
-
-
-def count_points(points: Float32Array, boxes: Boxes) -> IntArray:
-    """Points in each box, its surface included.
-
-    Args:
-        points: (N, 4) x, y, z [m], intensity.
-        boxes: K boxes in the same frame; one of unknown height (0) counts the points at any height.
-
-    Returns:
-        (K,) counts.
-    """
-    ordered = points[np.argsort(points[:, 0])]  # so that a box looks only at the slab of points that it spans in x
-    reach = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2.0
-    first = np.searchsorted(ordered[:, 0], boxes.center[:, 0] - reach, side="left")
-    last = np.searchsorted(ordered[:, 0], boxes.center[:, 0] + reach, side="right")
-    counts = np.zeros(len(boxes), dtype=np.int64)
-    for row in range(len(boxes)):
-        offset = ordered[first[row] : last[row], :3] - boxes.center[row]
-        c, s = np.cos(boxes.yaw[row]), np.sin(boxes.yaw[row])
-        length, width, height = boxes.size[row] / 2.0
-        inside = (np.abs(c * offset[:, 0] + s * offset[:, 1]) <= length) & (
-            np.abs(c * offset[:, 1] - s * offset[:, 0]) <= width
-        )
-        if height > 0.0:
-            inside &= np.abs(offset[:, 2]) <= height
-        counts[row] = np.count_nonzero(inside)
-    return counts

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cobevglue.datasets import DATASETS
+from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.training.config import SIMULATED, DataConfig
-from cobevglue.training.samples import DatasetEpisodes, EpisodeSource, SampleLike
+from cobevglue.training.samples import DatasetEpisodes, EpisodeSource
 
 __all__ = ["Repeated", "make_source"]
 
@@ -19,7 +20,7 @@ class Repeated:
     source: EpisodeSource
     episodes: int
 
-    def episode(self, index: int) -> Sequence[SampleLike]:
+    def episode(self, index: int) -> Sequence[LabelledCloud]:
         """Episode `index`, counted in a circle; see `EpisodeSource`."""
         return self.source.episode(index % self.episodes)
 

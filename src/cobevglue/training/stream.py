@@ -8,7 +8,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
-from cobevglue.training.samples import EpisodeSource, SampleLike
+from cobevglue.datasets.labelled_cloud import LabelledCloud
+from cobevglue.training.samples import EpisodeSource
 
 __all__ = ["EpisodeStream", "FixedStream"]
 
@@ -33,7 +34,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
     def __init__(
         self,
         source: EpisodeSource,
-        prepare: Callable[[SampleLike, np.random.Generator], Item],
+        prepare: Callable[[LabelledCloud, np.random.Generator], Item],
         *,
         epochs: range,
         batches_per_epoch: int,
@@ -73,7 +74,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
     def _epoch(self, epoch: int, worker: int, workers: int, count: int) -> Iterator[Item]:
         random = np.random.default_rng([self._seed, _STREAM, epoch, self._rank, worker])
         episodes = self._episodes(epoch, worker, workers)
-        pool: list[SampleLike] = []
+        pool: list[LabelledCloud] = []
         episode_size = 0
         for remaining in range(count, 0, -1):
             while len(pool) < remaining and len(pool) <= (self._pool - 1) * episode_size:
@@ -84,7 +85,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
             pool[chosen], pool[-1] = pool[-1], pool[chosen]
             yield self._prepare(pool.pop(), random)
 
-    def _episodes(self, epoch: int, worker: int, workers: int) -> Iterator[list[SampleLike]]:
+    def _episodes(self, epoch: int, worker: int, workers: int) -> Iterator[list[LabelledCloud]]:
         """The episodes of one worker in one epoch: no other has the same, and other epochs have others."""
         # An epoch uses at most one episode for each of its samples, so this leaves room for all.
         index = epoch * self._batches_per_epoch * self._batch_size * self._processes
@@ -105,7 +106,7 @@ class FixedStream(IterableDataset[Item], Generic[Item]):
     def __init__(
         self,
         source: EpisodeSource,
-        prepare: Callable[[SampleLike, np.random.Generator], Item],
+        prepare: Callable[[LabelledCloud, np.random.Generator], Item],
         episodes: range,
     ) -> None:
         """Nothing is made before the first sample is asked for.

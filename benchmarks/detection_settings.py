@@ -1,0 +1,78 @@
+"""How the settings of `DetectionConfig` were chosen: on the simulated validation split, and nothing else.
+
+    python benchmarks/detection_settings.py --weights runs/compact/last.safetensors --clouds 120
+
+The network runs once on each cloud; then each setting is changed on its own, beside the others as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from typing import Any
+
+import torch
+
+from cobevglue.evaluation.detection import evaluate_detections
+from cobevglue.evaluation.detection_data import Cloud, simulated_clouds
+from cobevglue.evaluation.detection_matching import DetectionFrame
+from cobevglue.perception import PointPillars
+from cobevglue.perception.config import DetectionConfig
+from cobevglue.perception.decode import decode
+from cobevglue.perception.head import HeadOutput
+from cobevglue.simulation.episodes import SimulatedEpisodes
+
+RANGE = (-70.0, 70.0, -39.0, 39.0)
+MIN_POINTS = 5
+CHANGES: tuple[dict[str, Any], ...] = (
+    {},
+    {"uncertainty_penalty": 0.25},
+    {"uncertainty_penalty": 0.5},
+    {"uncertainty_penalty": 1.0},
+    {"uncertainty_penalty": 2.0},
+    {"variance_voting": True, "voting_iou": 0.3},
+    {"variance_voting": True, "voting_iou": 0.5},
+    {"variance_voting": True, "voting_iou": 0.7},
+    {"variance_voting": True, "uncertainty_penalty": 0.5},
+    {"variance_voting": True, "uncertainty_penalty": 1.0},
+    {"nms_iou": 0.05},
+    {"nms_iou": 0.1},
+    {"nms_iou": 0.2},
+    {"nms_iou": 0.3},
+    {"score_threshold": 0.05},
+    {"score_threshold": 0.2},
+)
+
+
+def main() -> None:
+    """Print one row for each change."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", default="compact", help="a shipped name, or a .safetensors file")
+    parser.add_argument("--clouds", type=int, default=120)
+    arguments = parser.parse_args()
+    name = str(arguments.weights)
+    detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {name}\n")
+    seen: list[tuple[Cloud, HeadOutput]] = []
+    with torch.inference_mode():
+        for cloud in simulated_clouds(SimulatedEpisodes("validation"), arguments.clouds):
+            assert cloud.points is not None
+            seen.append((cloud, detector([torch.from_numpy(cloud.points)])))
+    print("| change | AP 0.5 | AP 0.7 |\n|---|---|---|")
+    for change in CHANGES:
+        settings = DetectionConfig.model_validate({**detector.detection.model_dump(), **change})
+        frames = [frame(cloud, output, detector, settings) for cloud, output in seen]
+        report = evaluate_detections(frames, evaluation_range=RANGE, min_points=MIN_POINTS)
+        print(f"| {change or 'as it is'} | {report.ap(0.5):.4f} | {report.ap(0.7):.4f} |", flush=True)
+
+
+def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars, settings: DetectionConfig) -> DetectionFrame:
+    """What these settings make of the network's output."""
+    ((boxes, _),) = decode(output, detector.anchors, settings)
+    return DetectionFrame(boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Times the steps between a stored point cloud and tracked boxes, with the detector that comes with the package."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["CLOUDS", "measure_perception"]
+
+CLOUDS = 20
+"""So many frames of a simulated drive are timed, after some that are not."""
+_WARM_UP = 3
+_NETWORK, _SEED = "junction_test_0", 0
+
+
+def measure_perception(threads: int) -> dict[str, Any] | None:
+    """Time every stage of perception on simulated clouds of OPV2V's sensor.
+
+    Args:
+        threads: of torch.
+
+    Returns:
+        Ready for JSON: `stages[stage]` with `median_ms` and `best_ms`; how many points a cloud had, the threads, and
+        the largest memory of this process so far. None where torch or the simulation is not installed.
+    """
+    try:
+        import torch
+
+        from cobevglue.datasets.opv2v_writer import write_opv2v_frame
+        from cobevglue.datasets.pcd import read_pcd
+        from cobevglue.perception import Perception, PointPillars
+        from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
+
+        snapshots = EpisodeSettings(snapshots=4, agents=5, vary_sensor=False)
+        clouds = SimulatedEpisodes("test", _SEED, snapshots).episode(0)
+    except ModuleNotFoundError:
+        return None
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    perception = Perception(PointPillars.pretrained("compact"))
+    taken: list[dict[str, float]] = []
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for number, cloud in enumerate(clouds):
+                write_opv2v_frame(Path(folder), f"{number:06d}", np.eye(4), cloud.boxes, cloud.points)
+            for number in range(CLOUDS + _WARM_UP):
+                file = Path(folder) / f"{number % len(clouds):06d}.pcd"
+                start = time.perf_counter()
+                points = read_pcd(file)
+                loaded = time.perf_counter()
+                stages = perception.step(points).seconds
+                taken.append({"load": loaded - start, **stages, "all": time.perf_counter() - start})
+    finally:
+        torch.set_num_threads(before)
+    timed = taken[_WARM_UP:]
+    return {
+        "stages": {
+            stage: {
+                "median_ms": 1e3 * statistics.median(one[stage] for one in timed),
+                "best_ms": 1e3 * min(one[stage] for one in timed),
+            }
+            for stage in timed[0]
+        },
+        "points": round(statistics.mean(len(cloud.points) for cloud in clouds)),
+        "threads": threads,
+        "largest_memory_mb": _largest_memory(),
+    }
+
+
+def _largest_memory() -> float | None:
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return None
+    import sys
+
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest / (1024**2 if sys.platform == "darwin" else 1024)
