@@ -44,8 +44,8 @@ class LossConfig(Settings):
     Attributes:
         classification: of the focal loss.
         box: of the smooth L1 loss of the residuals.
-        direction: of the cross-entropy of the direction; SECOND has 0.2, with which one box in seven stays flipped in as
-            few steps as a CPU can do.
+        direction: of the cross-entropy of the direction; SECOND has 0.2, with which one box in seven stays flipped
+            in as few steps as a CPU can do.
         uncertainty: of the negative log-likelihood of the errors under the predicted variances.
         alpha: share of the positives in the focal loss.
         gamma: how little anchors count that are right already.
