@@ -16,9 +16,7 @@ import pytest
 import cobevglue
 from cobevglue import SE2, Boxes
 from cobevglue.cli import main
-from cobevglue.datasets import OPV2V
 from cobevglue.messages import to_dict, write_object_list
-from cobevglue.simulation import Junction, JunctionSettings
 
 COMMANDS = ("demo", "align", "simulate", "bench")
 EGO = Boxes(
@@ -305,72 +303,6 @@ def test_folders_that_do_not_fit(
     write_folders(tmp_path, ["1.json"], ["2.json"])
     assert main(["align", *map(str, words(tmp_path))]) == 2, what
     assert said in capsys.readouterr().err
-
-
-# simulate
-
-
-def simulate(out: Path, *more: str) -> int:
-    return main(["simulate", str(out), "--frames", "3", "--agents", "3", "--seed", "5", *more])
-
-
-def test_what_is_simulated_reads_back_as_opv2v(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path, "--json") == 0
-    report = json.loads(capsys.readouterr().out)
-    assert (report["files_written"], report["files_kept"]) == (9, 0)
-    scenario = OPV2V(tmp_path, split="test")["junction_0005"]
-    scene = Junction(5, JunctionSettings(agents=3, duration=0.3))
-    assert [frame.time for frame in scenario] == pytest.approx([frame.time for frame in scene])
-    for read, made in zip(scenario, scene, strict=True):
-        assert list(read.agents) == ["0", "1", "2"]
-        for name, agent in read.agents.items():
-            view = made.agents[f"car{int(name) + 1}"]
-            assert view.visible.track_id is not None
-            assert agent.objects.track_id is not None
-            order = np.argsort(view.visible.track_id)
-            row = np.argsort(agent.objects.track_id)
-            assert agent.objects.track_id[row].tolist() == view.visible.track_id[order].tolist()
-            np.testing.assert_allclose(agent.objects.center[row], view.visible.center[order], atol=1e-6)
-            assert SE2.from_matrix(agent.world_SE3_lidar).error_to(view.world_SE2_agent) == pytest.approx((0, 0))
-            assert agent.points is None
-
-
-def test_simulated_frames_align(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", str(tmp_path), "--frames", "5"]) == 0
-    capsys.readouterr()
-    scenario = tmp_path / "test" / "junction_0000"
-    assert main(["align", str(scenario / "0"), str(scenario / "1"), "--json"]) == 0
-    pose = json.loads(capsys.readouterr().out)["ego_SE2_other"]
-    truth = Junction(0, JunctionSettings(duration=0.5))[4].ego_SE2_other("car1", "car2")
-    metres, radians = SE2(pose["x"], pose["y"], pose["yaw"]).error_to(truth)
-    assert metres < 0.5
-    assert math.degrees(radians) < 0.5
-
-
-def test_simulate_goes_on_where_it_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path) == 0
-    lost = tmp_path / "test" / "junction_0005" / "1" / "000002.yaml"
-    whole = lost.read_bytes()
-    lost.unlink()
-    capsys.readouterr()
-    assert simulate(tmp_path, "--json") == 0
-    report = json.loads(capsys.readouterr().out)
-    assert (report["files_written"], report["files_kept"]) == (1, 8)
-    assert lost.read_bytes() == whole
-    assert not list(tmp_path.rglob(".partial*"))
-
-
-def test_scenes_with_other_settings_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path) == 0
-    capsys.readouterr()
-    assert simulate(tmp_path, "--frames", "4") == 2
-    assert "another scene" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("split", ["../elsewhere", "a/b", "", "."])
-def test_a_split_is_a_plain_name(split: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path / "data", "--split", split) == 2
-    assert "plain folder name" in capsys.readouterr().err
 
 
 # bench

@@ -1,4 +1,4 @@
-"""`cobevglue evaluate` on a tree that `cobevglue simulate` wrote."""
+"""`cobevglue evaluate` on a simulated junction in OPV2V's format."""
 
 from __future__ import annotations
 
@@ -10,16 +10,8 @@ import pytest
 from cobevglue.cli import main
 
 
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve frames of two agents in OPV2V's format."""
-    root = tmp_path_factory.mktemp("simulated")
-    assert main(["simulate", str(root), "--frames", "12", "--seed", "2"]) == 0
-    return root
-
-
-def test_it_prints_one_document_with_all_frames(simulated: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--root", str(simulated), "--perfect", "--json"]) == 0
+def test_it_prints_one_document_with_all_frames(junction_tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--root", str(junction_tree), "--perfect", "--json"]) == 0
     captured = capsys.readouterr()
     groups = json.loads(captured.out)
     assert groups["all"]["frames"] == 12
@@ -27,8 +19,8 @@ def test_it_prints_one_document_with_all_frames(simulated: Path, capsys: pytest.
     assert "junction" in captured.err  # progress goes to standard error
 
 
-def test_the_table_has_a_row_for_each_group(simulated: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--root", str(simulated), "--paper"]) == 0
+def test_the_table_has_a_row_for_each_group(junction_tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--root", str(junction_tree), "--paper"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.split()[:2] == ["all", "12"] for line in lines)
 
@@ -43,9 +35,9 @@ def test_the_table_has_a_row_for_each_group(simulated: Path, capsys: pytest.Capt
     ],
 )
 def test_bad_input_is_one_line(
-    simulated: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    junction_tree: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
-    assert main(["evaluate", *(word.replace("{root}", str(simulated)) for word in arguments)]) == 2
+    assert main(["evaluate", *(word.replace("{root}", str(junction_tree)) for word in arguments)]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert said in captured.err

@@ -49,10 +49,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def simulated(tmp_path_factory: pytest.TempPathFactory, junction_tree: Path) -> Path:
     """Twelve frames of two agents in OPV2V's format; agent 0 has clouds but for the last frame, agent 1 has none."""
-    root = tmp_path_factory.mktemp("simulated")
-    assert main(["simulate", str(root), "--frames", "12", "--seed", "2"]) == 0
+    root = tmp_path_factory.mktemp("simulated") / "root"
+    shutil.copytree(junction_tree, root)
     rng = np.random.default_rng(0)
     for label in sorted((root / "test").glob("*/0/*.yaml"))[:-1]:
         write_pcd(label.with_suffix(".pcd"), rng.uniform(-20.0, 20.0, (500, 3)).astype(np.float32))

@@ -1,47 +1,147 @@
-"""`cobevglue simulate`: a junction as a data set in OPV2V's format."""
+"""`cobevglue simulate`: drives of several agents as a data set, clouds and labels."""
 
 from __future__ import annotations
 
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import Enum
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from cobevglue.cli.errors import expected_errors
-from cobevglue.cli.output import print_json, print_note
+from cobevglue.cli.errors import InputError, expected_errors
+from cobevglue.cli.output import print_json
 
-__all__ = ["Format", "simulate"]
+__all__ = ["Format", "LidarName", "Split", "simulate"]
 
 
 class Format(str, Enum):
     """On-disk formats that can be written."""
 
     OPV2V = "opv2v"
+    V2V4REAL = "v2v4real"
+    DAIR_V2X = "dair-v2x"
+
+
+class Split(str, Enum):
+    """Splits; no road network is in two of them."""
+
+    TRAIN = "train"
+    VALIDATION = "validation"
+    TEST = "test"
+
+
+class LidarName(str, Enum):
+    """Sensors of vehicles."""
+
+    OPV2V = "opv2v"
+    BEAMS32 = "beams32"
+    BEAMS16 = "beams16"
 
 
 def simulate(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set; made if it is not there.")],
     kind: Annotated[Format, typer.Option("--format", help="Layout of the files.")] = Format.OPV2V,
-    split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
-    seed: Annotated[int, typer.Option(min=0, help="Of the scene.")] = 0,
-    frames: Annotated[int, typer.Option(min=1, max=6000, help="How many frames, 10 a second.")] = 80,
-    agents: Annotated[int, typer.Option(min=1, max=8, help="How many agents.")] = 2,
+    split: Annotated[
+        Split | None,
+        typer.Option(help="Whose road networks; also the folder's name. 'test' unless --network is of another."),
+    ] = None,
+    scenarios: Annotated[int, typer.Option(min=1, max=1000, help="How many drives.")] = 1,
+    frames: Annotated[int, typer.Option(min=1, max=9999, help="Of each drive, 10 a second.")] = 80,
+    agents: Annotated[
+        int | None, typer.Option(min=1, max=8, help="Vehicles with a LiDAR; 2 unless the format says otherwise.")
+    ] = None,
+    roadside_units: Annotated[
+        int | None, typer.Option(min=0, max=4, help="LiDARs on masts; 0 unless the format says otherwise.")
+    ] = None,
+    lidar: Annotated[LidarName, typer.Option(help="The vehicles' sensor.")] = LidarName.OPV2V,
+    network: Annotated[str | None, typer.Option(help="One road network; all of the split in turn if left out.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of worlds and traffic.")] = 0,
+    labels_only: Annotated[bool, typer.Option("--labels-only", help="Write no point clouds.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Write a simulated junction as a data set in OPV2V's format.
+    """Simulate drives of several vehicles with LiDARs, and write them as a data set.
 
-    The tree is OUT/SPLIT/junction_SEED/AGENT/NUMBER.yaml: poses, and the true boxes of what each agent saw. There are
-    no point clouds yet. If it is interrupted, the same command goes on where it stopped.
+    Traffic is SUMO's on stored road networks. Labels are exact: the vehicles that at least one point lies on, with the
+    number of points. --format v2v4real has two vehicles, dair-v2x one and a roadside unit. The same options give the
+    same files, and if it is interrupted, the same command goes on where it stopped.
+
+    Needs: pip install 'cobevglue[simulation]'
     """
-    from cobevglue.cli.junction_export import write_junction
+    _require_extra()
+    from cobevglue.simulation.export import export
+    from cobevglue.simulation.layouts import LAYOUTS, Task
+    from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenario, split_of
 
     with expected_errors():
-        written = write_junction(out, split, seed=seed, frames=frames, agents=agents, progress=print_note)
+        name = _split_name(split, None if network is None else split_of(network), network)
+        layout = LAYOUTS[kind.value](out, name, labels_only)
+        settings = ScenarioSettings(
+            frames=frames,
+            agents=agents or layout.agents or 2,
+            roadside_units=(layout.roadside_units or 0) if roadside_units is None else roadside_units,
+            lidar=lidar.value,
+        )
+        tasks = [Task(i, simulated_scenario(name, i, seed, settings, network)) for i in range(scenarios)]
+        started = time.perf_counter()
+        with _progress_bar() as progress:
+            report = export(layout, tasks, workers=workers or os.cpu_count() or 1, progress=progress)
+        seconds = time.perf_counter() - started
+    document: dict[str, Any] = {
+        "root": str(out),
+        "format": kind.value,
+        "split": name,
+        "scenarios": [{"name": task.scenario.name, "folder": str(layout.place(task))} for task in tasks],
+        "agents": settings.agents,
+        "roadside_units": settings.roadside_units,
+        "frames_written": report.frames_written,
+        "frames_kept": report.frames_kept,
+        "seconds": seconds,
+    }
     if as_json:
-        print_json(written)
+        print_json(document)
     else:
         print(
-            f"{written['scenario_folder']}: {written['files_written']} files written, "
-            f"{written['files_kept']} were there already"
+            f"{out}: {scenarios} x {frames} frames of {settings.agents + settings.roadside_units} agents, "
+            f"{report.frames_written} written, {report.frames_kept} were there already"
         )
+
+
+def _require_extra() -> None:
+    missing = [module for module in ("libsumo", "embreex", "trimesh") if find_spec(module) is None]
+    if missing:
+        raise InputError(f"simulation needs {', '.join(missing)}: pip install 'cobevglue[simulation]'")
+
+
+def _split_name(split: Split | None, of_network: str | None, network: str | None) -> str:
+    if split is not None and of_network not in (None, split.value):
+        raise InputError(f"--network: {network} is of the split {of_network!r}, not {split.value!r}")
+    return of_network or (split or Split.TEST).value
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error; gives what to call with how many are done and how many there are."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task("frames", total=None)
+
+    def show(done: int, total: int) -> None:
+        bar.start()  # with the first frame: what is wrong from the beginning is said without a bar
+        bar.update(task, completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        if bar.live.is_started:
+            bar.stop()
