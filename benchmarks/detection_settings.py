@@ -60,12 +60,15 @@ def main() -> None:
         for cloud in simulated_clouds(SimulatedEpisodes("validation"), arguments.clouds):
             assert cloud.points is not None
             seen.append((cloud, detector([torch.from_numpy(cloud.points)])))
-    print("| change | AP 0.5 | AP 0.7 |\n|---|---|---|")
+    print("| change | AP 0.5 | AP 0.7 | flipped |\n|---|---|---|---|")
     for change in CHANGES:
         settings = DetectionConfig.model_validate({**detector.detection.model_dump(), **change})
         frames = [frame(cloud, output, detector, settings) for cloud, output in seen]
         report = evaluate_detections(frames, evaluation_range=RANGE, min_points=MIN_POINTS)
-        print(f"| {change or 'as it is'} | {report.ap(0.5):.4f} | {report.ap(0.7):.4f} |", flush=True)
+        print(
+            f"| {change or 'as it is'} | {report.ap(0.5):.4f} | {report.ap(0.7):.4f} | {report.errors.flipped:.3f} |",
+            flush=True,
+        )
 
 
 def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars, settings: DetectionConfig) -> DetectionFrame:

@@ -109,6 +109,14 @@ def test_a_flipped_voter_turns_nothing_round() -> None:
     assert -0.05 < boxes.yaw[0] < 0.0
 
 
+def test_a_sure_voter_turns_an_unsure_box_round() -> None:
+    flipped = [*CAR[:6], math.pi]
+    output = said((CELL, CAR, 0.9, 0.2), (CELL + 4, flipped, 0.8, 0.2))
+    output.direction[0, CELL] *= 0.01
+    boxes, _ = decoded(output, variance_voting=True)
+    assert abs(boxes.yaw[0]) == pytest.approx(math.pi, abs=1e-5)
+
+
 @pytest.mark.parametrize("value", [-1e4, 1e4])
 def test_extreme_output_still_gives_valid_boxes(value: float) -> None:
     output = said((CELL, CAR, 0.9, 0.5))

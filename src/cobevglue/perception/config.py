@@ -47,7 +47,7 @@ class DetectionConfig(Settings):
             ranks by the score. The scores handed out stay what they are.
         variance_voting: let the suppressed boxes move those that stay: average of all that overlap by `voting_iou` or
             more, weighted by the overlap and the inverse predicted variance (He et al., "Bounding Box Regression with
-            Uncertainty for Accurate Object Detection", CVPR 2019).
+            Uncertainty for Accurate Object Detection", CVPR 2019). Which way they face is put to the vote, too.
         voting_iou: see there.
     """
 

@@ -48,7 +48,8 @@ def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig
     def chosen(values: torch.Tensor) -> FloatArray:
         return values[index].double().cpu().numpy()
 
-    values = anchors.decode(chosen(output.residuals), chosen(output.direction).argmax(axis=1), index.cpu().numpy())
+    direction = chosen(output.direction)
+    values = anchors.decode(chosen(output.residuals), direction.argmax(axis=1), index.cpu().numpy())
     variance = np.exp(np.clip(chosen(output.log_variance), MIN_LOG_VARIANCE, MAX_LOG_VARIANCE))
     score = torch.sigmoid(logits).double().cpu().numpy()
     candidates = Boxes(values[:, :3], values[:, 3:6], values[:, 6], score, label=np.full(len(values), LABEL))
@@ -58,12 +59,21 @@ def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig
     rows = nms(ranked, config.nms_iou)[: config.max_detections]
     boxes = candidates[rows]
     if config.variance_voting and len(boxes):
-        boxes = _vote(boxes, candidates, variance, config.voting_iou)
+        sure = np.tanh(np.abs(direction[:, 1] - direction[:, 0]) / 2)  # difference of the two probabilities
+        boxes = _vote(boxes, candidates, variance, sure, config.voting_iou)
     return boxes, variance[rows]
 
 
-def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, min_iou: float) -> Boxes:
-    """K boxes moved to what the C candidates that overlap them say on average; `variance` is the candidates' (C, 3)."""
+def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, sure: FloatArray, min_iou: float) -> Boxes:
+    """K boxes moved to what the C candidates that overlap them say on average.
+
+    Args:
+        boxes: those that stay.
+        candidates: all, `boxes` among them, with scores.
+        variance: (C, 3) of the candidates.
+        sure: (C,) how sure each is which way it faces, 0 to 1.
+        min_iou: candidates that overlap by less have no vote.
+    """
     iou = bev_iou(boxes, candidates)
     vote = np.where(iou >= min_iou, np.exp(-((1.0 - iou) ** 2) / _TEMPERATURE), 0.0)
 
@@ -73,7 +83,9 @@ def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, min_iou: float)
 
     xy = np.column_stack([average(candidates.center[None, :, i, None], vote / variance[:, i])[:, 0] for i in range(2)])
     turn = candidates.yaw - boxes.yaw[:, None]
+    assert candidates.score is not None
+    flipped = (vote * sure * candidates.score * np.cos(turn)).sum(axis=1) < 0.0
     turn -= math.pi * np.round(turn / math.pi)  # a flipped candidate knows the axis all the same
-    yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0])
+    yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0] + math.pi * flipped)
     rest = average(np.column_stack([candidates.center[:, 2], candidates.size])[None], vote)
     return boxes.replace(center=np.column_stack([xy, rest[:, 0]]), size=rest[:, 1:], yaw=yaw)
