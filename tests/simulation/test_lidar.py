@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,7 +120,7 @@ def _nothing_lost() -> dict[str, float]:
 def test_surfaces_have_their_own_intensity_where_the_sensor_measures_it() -> None:
     settings = PERFECT.model_copy(update={"intensity": "surface", "attenuation": 0.0, "beams": 1, "elevation": (0, 0)})
     mesh = Mesh.concatenate([wall(10.0), wall(-10.0)])
-    mesh = Mesh(mesh.triangles, np.array([0.8, 0.8, 0.2, 0.2], dtype=np.float32), mesh.transmission)
+    mesh = replace(mesh, reflectivity=np.array([0.8, 0.8, 0.2, 0.2], dtype=np.float32))
     points = scan((RayScene(mesh),), at(0, 0, 0), settings, rng()).points
     head_on = np.abs(points[:, 1]) < 1.0
     front = points[:, 0] > 0

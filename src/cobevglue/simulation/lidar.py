@@ -120,7 +120,7 @@ class RayScene:
                     "LiDAR simulation needs embreex: pip install 'cobevglue[simulation]'"
                 ) from error
             self._embree = EmbreeScene()
-            TriangleMesh(self._embree, np.ascontiguousarray(mesh.triangles))
+            TriangleMesh(self._embree, mesh.vertices, mesh.faces)
 
     def first_hits(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, IntArray]:
         """(R,) distance [m] to the first triangle along each ray, infinite for none; (R,) its row, -1 for none."""

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from cobevglue.typing import ArrayLike, Float32Array
+from cobevglue.typing import ArrayLike, Float32Array, Int32Array
 
 __all__ = ["Mesh", "box", "cylinder", "ellipsoid", "leaves", "quads"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Mesh:
-    """T triangles.
+    """T triangles over V corners, which neighbours may share.
 
     Attributes:
-        triangles: (T, 3, 3) float32 corners [m], axes x forward, y left, z up.
+        vertices: (V, 3) float32 corners [m], axes x forward, y left, z up.
+        faces: (T, 3) int32 rows of `vertices`.
         reflectivity: (T,) float32 share of the light that comes back, 0 to 1.
         transmission: (T,) float32 probability that a ray goes on through: 0 for a wall, near 1 for clear glass.
     """
 
-    triangles: Float32Array
+    vertices: Float32Array
+    faces: Int32Array
     reflectivity: Float32Array
     transmission: Float32Array
 
     @staticmethod
     def of(triangles: ArrayLike, reflectivity: float = 0.5, transmission: float = 0.0) -> Mesh:
         """Triangles (T, 3, 3) of one material."""
-        corners = np.asarray(triangles, dtype=np.float32).reshape(-1, 3, 3)
-        count = len(corners)
+        vertices = np.asarray(triangles, dtype=np.float32).reshape(-1, 3)
+        count = len(vertices) // 3
         return Mesh(
-            corners, np.full(count, reflectivity, dtype=np.float32), np.full(count, transmission, dtype=np.float32)
+            vertices,
+            np.arange(len(vertices), dtype=np.int32).reshape(-1, 3),
+            np.full(count, reflectivity, dtype=np.float32),
+            np.full(count, transmission, dtype=np.float32),
         )
 
     @staticmethod
@@ -41,26 +46,37 @@ class Mesh:
         """All triangles of several meshes, in their order."""
         if not meshes:
             return Mesh.of(np.zeros((0, 3, 3)))
+        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])], dtype=np.int32)
         return Mesh(
-            np.concatenate([mesh.triangles for mesh in meshes]),
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
             np.concatenate([mesh.reflectivity for mesh in meshes]),
             np.concatenate([mesh.transmission for mesh in meshes]),
         )
 
     def __len__(self) -> int:
-        return len(self.triangles)
+        return len(self.faces)
+
+    @property
+    def triangles(self) -> Float32Array:
+        """(T, 3, 3) the corners of each triangle [m]."""
+        return self.vertices[self.faces]
+
+    def welded(self) -> Mesh:
+        """The same triangles with equal corners stored once: cheaper to move, and to build a scene of."""
+        vertices, row = np.unique(self.vertices, axis=0, return_inverse=True)
+        return replace(self, vertices=vertices, faces=row.reshape(-1).astype(np.int32)[self.faces])
 
     def moved(self, xyz: ArrayLike, yaw: float = 0.0, scale: ArrayLike = 1.0) -> Mesh:
         """Scaled about the origin, turned about z by `yaw` [rad], then shifted by `xyz` [m]."""
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        corners = (self.triangles * np.asarray(scale, dtype=np.float64)) @ turn.T + np.asarray(xyz, dtype=np.float64)
-        return Mesh(corners.astype(np.float32), self.reflectivity, self.transmission)
+        vertices = (self.vertices * np.asarray(scale, dtype=np.float64)) @ turn.T + np.asarray(xyz, dtype=np.float64)
+        return replace(self, vertices=vertices.astype(np.float32))
 
     def bounds(self) -> tuple[Float32Array, Float32Array]:
         """(3,) lower and (3,) upper corner of the axis-aligned box around all triangles."""
-        corners = self.triangles.reshape(-1, 3)
-        return corners.min(axis=0), corners.max(axis=0)
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
 def box(center: ArrayLike, size: ArrayLike, yaw: float = 0.0, reflectivity: float = 0.5) -> Mesh:

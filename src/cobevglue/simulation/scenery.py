@@ -5,7 +5,7 @@ Each world draws its own character: how built-up it is, how green, how hilly, ho
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -282,7 +282,7 @@ class _Builder:
             else:
                 wall = box((x, y, z + height / 2), (length, rng.uniform(0.05, 0.4), height), angle, 0.4)
                 fence = 0.6 if rng.random() < 0.3 else 0.0
-                self.parts.append(Mesh(wall.triangles, wall.reflectivity, np.full(len(wall), fence, dtype=np.float32)))
+                self.parts.append(replace(wall, transmission=np.full(len(wall), fence, dtype=np.float32)))
 
     def _street_furniture(self, pavement: float, density: float) -> None:
         rng = self.rng

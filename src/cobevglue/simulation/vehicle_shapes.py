@@ -488,4 +488,4 @@ def _fitted(mesh: Mesh, size: tuple[float, float, float]) -> Mesh:
     low, high = mesh.bounds()
     scale = np.asarray(size) / (high - low)
     middle = (low + high) / 2
-    return mesh.moved((-middle[0] * scale[0], -middle[1] * scale[1], -low[2] * scale[2]), 0.0, scale)
+    return mesh.moved((-middle[0] * scale[0], -middle[1] * scale[1], -low[2] * scale[2]), 0.0, scale).welded()
