@@ -66,7 +66,7 @@ def main() -> None:
 
 def real(detector: PointPillars, data: Path) -> None:
     """Average precision on OPV2V's clouds, and which objects are missed."""
-    clouds = [cloud for cloud in dataset_clouds(OPV2V(data, "test_culvercity"), SCENARIO) if cloud.points is not None]
+    clouds = [cloud for cloud in dataset_clouds([OPV2V(data, "test_culvercity")[SCENARIO]]) if cloud.points is not None]
     frames = [detect(cloud, detector) for cloud in clouds]
     show(f"OPV2V {SCENARIO}, {len(frames)} clouds, range {RANGE}", evaluate_detections(frames, evaluation_range=RANGE))
     failures = [f for frame in frames for f in find_failures(frame, threshold=0.7, evaluation_range=RANGE)]

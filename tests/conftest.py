@@ -1,7 +1,8 @@
-"""Trees of files that several tests read."""
+"""Files that several tests read: the folder of real ones, where it is there, and trees made here."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,24 @@ import pytest
 
 from cobevglue.datasets import write_opv2v_frame
 from cobevglue.simulation import Junction, JunctionSettings
+
+PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    folder = Path(os.environ.get("COBEVGLUE_DATA", PROJECT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real data: set COBEVGLUE_DATA (looked for {folder})")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def culver_city(real_data: Path) -> Path:
+    root = real_data / "opv2v"
+    if not (root / "test_culvercity").is_dir():
+        pytest.skip(f"no OPV2V files in {real_data}")
+    return root
 
 
 @pytest.fixture(scope="session")

@@ -315,13 +315,19 @@ def test_bench_times_every_step(
     monkeypatch.setattr("cobevglue.cli.measure.OBJECT_COUNTS", (5, 8))
     monkeypatch.setattr("cobevglue.cli.measure._FRAMES", 7)
     monkeypatch.setattr("cobevglue.cli.measure._PAPER_OBJECTS_AT_MOST", 5)
+    monkeypatch.setattr("cobevglue.cli.measure_perception.CLOUDS", 2)
     assert main(["bench", *(["--json"] if as_json else [])]) == 0
     out = capsys.readouterr().out
     if not as_json:
         assert "BEVGlue, first frame, median" in out
+        assert "backbone" in out
         return
     report = json.loads(out)
     assert report["message_bytes"] == {"5": 28 + 5 * 32, "8": 28 + 8 * 32}
+    stages = report["perception"]["stages"]
+    assert list(stages) == ["load", "pillars", "backbone", "head", "boxes", "tracking", "all"]
+    assert all(0 < timed["best_ms"] <= timed["median_ms"] for timed in stages.values())
+    assert report["perception"]["points"] > 10_000
     for step, timed in report["steps"].items():
         assert 0 < timed["5"]["best_ms"] <= timed["5"]["median_ms"]
         assert timed["5"]["repeats"] >= 1

@@ -145,7 +145,8 @@ def _clouds(task: DetectTask) -> Iterator[Cloud]:
         return simulated_clouds(SimulatedEpisodes(task.split, task.seed), task.frames or _SIMULATED_CLOUDS)
     if task.root is None:
         raise InputError(f"--dataset {task.dataset} needs --root, the folder of the data set")
-    return dataset_clouds(DATASETS[task.dataset](task.root, task.split), task.scenario)
+    dataset = DATASETS[task.dataset](task.root, task.split)
+    return dataset_clouds(dataset if task.scenario is None else [dataset[task.scenario]])
 
 
 def _detected(

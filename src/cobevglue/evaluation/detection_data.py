@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from cobevglue.boxes import Boxes
-from cobevglue.datasets import Dataset
+from cobevglue.datasets import Scenario
 from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
 from cobevglue.evaluation.detection_matching import DetectionFrame
 from cobevglue.typing import Float32Array, IntArray
@@ -52,18 +52,17 @@ class Cloud:
     point_count: IntArray
 
 
-def dataset_clouds(dataset: Dataset, scenario: str | None = None) -> Iterator[Cloud]:
+def dataset_clouds(scenarios: Iterable[Scenario]) -> Iterator[Cloud]:
     """Every agent of every frame, in order, with its own labels; also those without a cloud, to be counted.
 
     Args:
-        dataset: a split of a data set.
-        scenario: name of the only one to go through.
+        scenarios: a split of a data set, or some of its scenarios.
 
     Raises:
-        ValueError: no such scenario, or a broken file; names it.
+        ValueError: a broken file; names it.
     """
-    for drive in dataset if scenario is None else [dataset[scenario]]:
-        for frame in drive:
+    for scenario in scenarios:
+        for frame in scenario:
             for name, agent in frame.agents.items():
                 points, where = agent.points, f"{frame.scenario}/{frame.timestamp}"
                 if points is None:

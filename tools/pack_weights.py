@@ -1,0 +1,41 @@
+"""Makes the weights that come with the package from a training run: half precision, and how they came about inside.
+
+    python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
+
+Further files are the runs that it started from (`init_from`), the first one first; of each, commit, command and
+settings are kept. How boxes are chosen is no part of training, and is taken from `CONFIGS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from cobevglue.perception import CONFIGS, PointPillars
+
+WEIGHTS = Path(__file__).parent.parent / "src" / "cobevglue" / "perception" / "weights"
+
+
+def main() -> None:
+    """Write `weights/NAME.safetensors`."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=sorted(CONFIGS))
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("started_from", type=Path, nargs="*")
+    arguments = parser.parse_args()
+    trained = PointPillars.load(arguments.weights)
+    config = CONFIGS[arguments.name]
+    if trained.config.model_copy(update={"detection": config.detection}) != config:
+        raise SystemExit(f"{arguments.weights}: is not of the configuration {arguments.name}")
+    detector = PointPillars(config)
+    detector.load_state_dict(trained.state_dict())
+    stages: list[dict[str, Any]] = [PointPillars.load(path).metadata for path in arguments.started_from]
+    WEIGHTS.mkdir(exist_ok=True)
+    file = WEIGHTS / f"{arguments.name}.safetensors"
+    detector.save(file, {"stages": [*stages, trained.metadata]}, half=True)
+    print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
