@@ -137,7 +137,7 @@ def speed(detector: PointPillars, data: Path) -> None:
             start = time.perf_counter()
             points = agent.points
             if points is None:
-                break
+                continue
             loaded = time.perf_counter()
             stages = perception.step(points).seconds
             seconds.append({"load": loaded - start, **stages, "all": time.perf_counter() - start})
