@@ -69,14 +69,14 @@ def trained() -> PointPillars:
     detector = PointPillars(SMALL)
     for module in detector.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
-            module.momentum = 0.3  # a hundred steps are too few for 0.01
+            module.momentum = 0.3  # so few steps are too few for 0.01
     cloud = torch.from_numpy(cloud_of(OBJECTS))
     targets = assign_targets(OBJECTS, np.zeros(len(OBJECTS), dtype=bool), detector.anchors)
     batch = collate_targets([targets], len(detector.anchors))
     loss = DetectionLoss(SMALL)
     optimizer = torch.optim.AdamW(detector.parameters(), lr=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-2, total_steps=100)
-    for _ in range(100):
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-2, total_steps=160)
+    for _ in range(160):
         optimizer.zero_grad()
         loss(detector([cloud]), batch).total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
