@@ -127,7 +127,9 @@ class RayScene:
         if self._embree is None:
             return np.full(len(origins), np.inf, dtype=np.float32), np.full(len(origins), -1, dtype=np.int32)
         hits = self._embree.run(origins, directions, output=True)
-        return np.where(hits["primID"] < 0, np.float32(np.inf), hits["tfar"]), hits["primID"]
+        distance, row = hits["tfar"], hits["primID"]
+        distance[row < 0] = np.inf
+        return distance, row
 
     @cached_property
     def normals(self) -> Float32Array:
@@ -150,7 +152,9 @@ def scan(
         rng: for noise, drop-outs, and whether a ray goes through glass.
     """
     local = _noisy(settings.directions(), settings.angle_noise, rng)
-    directions = np.ascontiguousarray(local @ world_SE3_lidar[:3, :3].astype(np.float32).T)
+    rotation = world_SE3_lidar[:3, :3].astype(np.float32)
+    # Not `local @ rotation.T`: BLAS would take all cores for it and wait on them busily, beside other processes.
+    directions = local[:, :1] * rotation[:, 0] + local[:, 1:2] * rotation[:, 1] + local[:, 2:] * rotation[:, 2]
     start = world_SE3_lidar[:3, 3].astype(np.float32)
     hits = _opaque_hits(scenes, start, directions, rng)
     seen = np.flatnonzero(hits.distance < settings.range)
