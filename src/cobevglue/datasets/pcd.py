@@ -15,7 +15,7 @@ from cobevglue.typing import ArrayLike, Float32Array
 __all__ = ["read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
 
 
-def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
+def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
     """Points of a PCD file; those with a coordinate that is not finite (no return) are left out.
 
     OPV2V was written through Open3D, which knows no intensity: it is the red byte of the packed colour `rgb`, a 32-bit
@@ -33,7 +33,7 @@ def read_pcd(path: Path, left_handed: bool = False, intensity_scale: float = 1.0
         FileNotFoundError: the file is not there.
         ValueError: it cannot be read as PCD, or is shorter than its header says; names the file.
     """
-    data = _columns(path)
+    data = _columns(Path(path))
     names = data.dtype.names or ()
     missing = [name for name in ("x", "y", "z") if name not in names]
     if missing:
