@@ -18,17 +18,29 @@ from .two_processes import CONFIG
 
 TESTS = Path(__file__).resolve().parents[1]
 
+LOOPBACK = "lo0" if sys.platform == "darwin" else "lo"
+
 
 def torchrun(*words: object) -> subprocess.CompletedProcess[str]:
+    """Two processes of this program. Gloo now and then never connects them (seen once in four runs of the suite here,
+    torch 2.13, before a line of ours ran in the group): then they are stopped and started again."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    return subprocess.run(
-        [*launcher, *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(TESTS)},
-    )
+    command = [*launcher, *map(str, words)]
+    for _ in range(3):
+        with subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(TESTS), "GLOO_SOCKET_IFNAME": LOOPBACK},
+        ) as process:
+            try:
+                out, error = process.communicate(timeout=110)
+            except subprocess.TimeoutExpired:
+                process.terminate()  # the launcher then stops what it started
+                continue
+            return subprocess.CompletedProcess(command, process.returncode, out, error)
+    raise TimeoutError("torchrun: three times its processes did not finish")
 
 
 @pytest.fixture(scope="module")
