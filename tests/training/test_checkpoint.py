@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cobevglue.training.checkpoint import RunState, differing_keys, load_state, provenance, save_state, write_atomically
+from cobevglue.training.checkpoint import RunState, differing_keys, load_state, provenance, save_state
 
 CPU = torch.device("cpu")
 
@@ -32,20 +32,6 @@ def test_a_broken_file_is_named(tmp_path: Path, content: bytes) -> None:
 def test_a_missing_file_says_what_it_means(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no epoch of this run was completed"):
         load_state(tmp_path / "state.pt", CPU)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("old")
-
-    def fail(temporary: Path) -> None:
-        temporary.write_text("half")
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(path, fail)
-    assert path.read_text() == "old"
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize(

@@ -135,11 +135,7 @@ def noisy_label_sequences(
             frames = []
             for i, frame in enumerate(scenario):
                 if i in seen[a] and i in seen[b]:
-                    (ego, ego_ids), (other, other_ids) = seen[a][i], seen[b][i]
-                    world_SE3_ego, world_SE3_other = (frame.agents[names[k]].world_SE3_lidar for k in (a, b))
-                    truth = SE2.from_matrix(np.linalg.inv(world_SE3_ego) @ world_SE3_other)
-                    pairs = np.argwhere((ego_ids[:, None] == other_ids[None, :]) & (ego_ids[:, None] != _FALSE))
-                    frames.append(PairFrame(ego, other, truth, len(pairs), pairs))
+                    frames.append(_pair_frame(seen[a][i], frame.agents[names[a]], seen[b][i], frame.agents[names[b]]))
             yield AlignmentSequence(f"{scenario.name}/{names[a]}-{names[b]}", frames)
 
 
@@ -161,6 +157,16 @@ def _detect(
             ids[rows >= 0] = objects.track_id[rows[rows >= 0]]
         seen[i] = tracker.update(boxes), ids
     return seen
+
+
+def _pair_frame(
+    ego: tuple[Boxes, IntArray], ego_agent: AgentFrame, other: tuple[Boxes, IntArray], other_agent: AgentFrame
+) -> PairFrame:
+    """What two agents detected, each with the true object ids of its boxes (`_FALSE` for false ones), and the truth."""
+    (ego_boxes, ego_ids), (other_boxes, other_ids) = ego, other
+    truth = SE2.from_matrix(np.linalg.inv(ego_agent.world_SE3_lidar) @ other_agent.world_SE3_lidar)
+    pairs = np.argwhere((ego_ids[:, None] == other_ids[None, :]) & (ego_ids[:, None] != _FALSE))
+    return PairFrame(ego_boxes, other_boxes, truth, len(pairs), pairs)
 
 
 class Perceived(Protocol):
@@ -197,34 +203,24 @@ def perceived_sequences(
         frames: dict[tuple[str, str], list[PairFrame]] = {pair: [] for pair in itertools.combinations(names, 2)}
         for frame in scenario:
             seen = {
-                name: (perceivers[name].step(agent.points).boxes, agent)
+                name: (_with_ids(perceivers[name].step(agent.points).boxes, agent.objects), agent)
                 for name, agent in frame.agents.items()
                 if agent.points is not None
             }
             for (ego, other), pair_frames in frames.items():
                 if ego in seen and other in seen:
-                    pair_frames.append(_perceived_pair(*seen[ego], *seen[other]))
+                    pair_frames.append(_pair_frame(*seen[ego], *seen[other]))
         for (ego, other), pair_frames in frames.items():
             if pair_frames:
                 yield AlignmentSequence(f"{scenario.name}/{ego}-{other}", pair_frames)
 
 
-def _perceived_pair(ego: Boxes, ego_agent: AgentFrame, other: Boxes, other_agent: AgentFrame) -> PairFrame:
-    ids = []
-    for boxes, agent in ((ego, ego_agent), (other, other_agent)):
-        found, object_rows = _found(boxes, agent.objects)
-        assert agent.objects.track_id is not None
-        own = np.full(len(boxes), _FALSE)
-        own[found] = agent.objects.track_id[object_rows]
-        ids.append(own)
-    pairs = np.argwhere((ids[0][:, None] == ids[1][None, :]) & (ids[0][:, None] != _FALSE))
-    truth = SE2.from_matrix(np.linalg.inv(ego_agent.world_SE3_lidar) @ other_agent.world_SE3_lidar)
-    return PairFrame(ego, other, truth, len(pairs), pairs)
-
-
-def _found(detections: Boxes, objects: Boxes) -> tuple[IntArray, IntArray]:
-    """Rows of detections and of the objects they are of: one-to-one, those that overlap most first."""
+def _with_ids(detections: Boxes, objects: Boxes) -> tuple[Boxes, IntArray]:
+    """The detections, and the id of the object that each is of: one-to-one, those that overlap most first."""
+    assert objects.track_id is not None
     iou = bev_iou(detections, objects)
     rows, columns = linear_sum_assignment(-iou)
     overlapping = iou[rows, columns] > _DETECTED_IOU
-    return rows[overlapping], columns[overlapping]
+    ids = np.full(len(detections), _FALSE)
+    ids[rows[overlapping]] = objects.track_id[columns[overlapping]]
+    return detections, ids

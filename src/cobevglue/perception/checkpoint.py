@@ -6,7 +6,6 @@ Such a file holds numbers and text, no code: loading one from a stranger is safe
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+
+from cobevglue.datasets.whole_files import whole_file
 
 __all__ = ["Checkpoint", "load_checkpoint", "load_weights", "save_checkpoint"]
 
@@ -61,12 +62,8 @@ def save_checkpoint(
         "config": json.dumps(config),
         "metadata": json.dumps(dict(metadata or {})),
     }
-    part = Path(path).with_name(f"{Path(path).name}.{os.getpid()}.part")
-    try:
-        save_file(weights, part, header)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(Path(path)) as partial:
+        save_file(weights, partial, header)
 
 
 def load_checkpoint(path: str | Path, architecture: str) -> Checkpoint:

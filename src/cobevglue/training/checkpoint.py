@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from typing import Any
 import torch
 
 import cobevglue
+from cobevglue.datasets.whole_files import whole_file
 
-__all__ = ["RunState", "differing_keys", "load_state", "provenance", "save_state", "write_atomically"]
+__all__ = ["RunState", "differing_keys", "load_state", "provenance", "save_state"]
 
 _FORMAT = 1
 
@@ -50,7 +50,8 @@ class RunState:
 def save_state(path: Path, state: RunState) -> None:
     """Write a run's state; the file is either complete or the one before."""
     content = {**vars(state), "config": json.dumps(state.config), "format": _FORMAT}
-    write_atomically(path, lambda temporary: torch.save(content, temporary))
+    with whole_file(path) as partial:
+        torch.save(content, partial)
 
 
 def load_state(path: Path, device: torch.device) -> RunState:
@@ -70,16 +71,6 @@ def load_state(path: Path, device: torch.device) -> RunState:
         return RunState(**{**content, "config": json.loads(content["config"])})
     except Exception as error:  # whatever unpickling broken bytes raises
         raise ValueError(f"{path}: not the state of a run: {' '.join(str(error).split())[:200]}") from error
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` make a file beside `path`, and put it in its place when it is complete."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> list[str]:
