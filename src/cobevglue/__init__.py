@@ -9,9 +9,10 @@ if TYPE_CHECKING:
     from cobevglue.alignment import Alignment, BEVGlue, BEVGlueConfig
     from cobevglue.boxes import Boxes
     from cobevglue.se2 import SE2
+    from cobevglue.system import CoBEVGlue
 
 __version__ = "0.1.0"
-__all__ = ["SE2", "Alignment", "BEVGlue", "BEVGlueConfig", "Boxes", "__version__"]
+__all__ = ["SE2", "Alignment", "BEVGlue", "BEVGlueConfig", "Boxes", "CoBEVGlue", "__version__"]
 
 _HOME = {
     "SE2": "cobevglue.se2",
@@ -19,6 +20,7 @@ _HOME = {
     "BEVGlue": "cobevglue.alignment",
     "BEVGlueConfig": "cobevglue.alignment",
     "Boxes": "cobevglue.boxes",
+    "CoBEVGlue": "cobevglue.system",
 }
 
 

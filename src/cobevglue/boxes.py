@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from cobevglue.se2 import SE2
-from cobevglue.typing import ArrayLike, FloatArray, IntArray, StrArray
+from cobevglue.typing import ArrayLike, BoolArray, FloatArray, IntArray, StrArray
 
-__all__ = ["Boxes"]
+__all__ = ["Boxes", "covers_origin"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,6 +110,14 @@ class Boxes:
         turned = np.stack([c * half[..., 0] - s * half[..., 1], s * half[..., 0] + c * half[..., 1]], axis=-1)
         corners: FloatArray = turned + self.center[:, None, :2]
         return corners
+
+
+def covers_origin(boxes: Boxes) -> BoolArray:
+    """(N,) whether a box, seen from above, stands on the origin of its frame: in a LiDAR's frame, its carrier does."""
+    c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
+    x, y = boxes.center[:, 0], boxes.center[:, 1]
+    covers: BoolArray = (2 * abs(c * x + s * y) < boxes.size[:, 0]) & (2 * abs(c * y - s * x) < boxes.size[:, 1])
+    return covers
 
 
 def _set(boxes: Boxes, name: str, value: FloatArray | IntArray | StrArray | None) -> None:

@@ -12,9 +12,9 @@ from typing import overload
 
 import numpy as np
 
-from cobevglue.boxes import Boxes
+from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.poses import inverse_SE3, transform_boxes
-from cobevglue.typing import BoolArray, Float32Array, FloatArray, IntArray
+from cobevglue.typing import Float32Array, FloatArray, IntArray
 
 __all__ = ["AgentFrame", "Dataset", "Frame", "Scenario", "did_you_mean"]
 
@@ -119,7 +119,7 @@ class Frame:
                     parts.append(transform_boxes(new, ego_SE3_world @ agent.world_SE3_lidar))
                     known = np.concatenate([known, _ids(new)])
             union = Boxes.concatenate(parts)
-        return union if include_ego else union[~_covers_origin(union)]
+        return union if include_ego else union[~covers_origin(union)]
 
 
 class Scenario(Sequence[Frame]):
@@ -195,11 +195,3 @@ def _ids(boxes: Boxes) -> IntArray:
     if boxes.track_id is None:
         raise ValueError("the union of what agents see needs objects with a track_id")
     return boxes.track_id
-
-
-def _covers_origin(boxes: Boxes) -> BoolArray:
-    """(N,) whether a box, seen from above, stands on the origin of its frame."""
-    c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
-    x, y = boxes.center[:, 0], boxes.center[:, 1]
-    covers: BoolArray = (2 * abs(c * x + s * y) < boxes.size[:, 0]) & (2 * abs(c * y - s * x) < boxes.size[:, 1])
-    return covers

@@ -1,5 +1,6 @@
-"""What travels between agents: the object message in bytes, its size, and the object list as a JSON file."""
+"""What travels between agents: the object message and arrays in bytes, and the object list as a JSON file."""
 
+from cobevglue.messages.array_message import Arrays, decode_arrays, encode_arrays
 from cobevglue.messages.object_list import from_dict, read_object_list, to_dict, write_object_list
 from cobevglue.messages.object_message import (
     BYTES_PER_OBJECT,
@@ -20,10 +21,13 @@ __all__ = [
     "MAX_OBJECTS",
     "MAX_TRACK_ID",
     "VERSION",
+    "Arrays",
     "MessageError",
     "ObjectMessage",
     "decode",
+    "decode_arrays",
     "encode",
+    "encode_arrays",
     "encoded_size",
     "from_dict",
     "read_object_list",

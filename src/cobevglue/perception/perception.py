@@ -13,7 +13,7 @@ from torch import Tensor
 from cobevglue.boxes import Boxes
 from cobevglue.perception.point_pillars import PointPillars, check_points
 from cobevglue.tracking import Sort
-from cobevglue.typing import ArrayLike, FloatArray
+from cobevglue.typing import ArrayLike, Float32Array, FloatArray
 
 __all__ = ["Perception", "PerceptionOutput"]
 
@@ -23,6 +23,7 @@ class PerceptionOutput:
     """What one agent sees in one frame, in its LiDAR's frame.
 
     Attributes:
+        points: (N, 4) float32 x, y, z [m], intensity: the cloud itself.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
         boxes: detections good enough to be tracked, with `track_id`: what the agent tells others.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2] of the K `boxes`.
@@ -30,6 +31,7 @@ class PerceptionOutput:
         seconds: time spent in each stage [s].
     """
 
+    points: Float32Array
     features: tuple[Tensor, Tensor, Tensor]
     boxes: Boxes
     variance: FloatArray
@@ -69,10 +71,10 @@ class Perception:
         Raises:
             ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
         """
-        cloud = torch.from_numpy(check_points(points))
+        checked = check_points(points)
         seconds: dict[str, float] = {}
         with self._timed("pillars", seconds):
-            image = self.detector.encode([cloud])
+            image = self.detector.encode([torch.from_numpy(checked)])
         with self._timed("backbone", seconds):
             first, second, third = self.detector.multiscale(image)
         with self._timed("head", seconds):
@@ -83,7 +85,8 @@ class Perception:
             assert detections.score is not None
             good = detections.score >= self.min_track_score
             tracked = self.tracker.update(detections[good], time)
-        return PerceptionOutput((first[0], second[0], third[0]), tracked, variance[good], detections, seconds)
+        features = (first[0], second[0], third[0])
+        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds)
 
     @contextmanager
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:

@@ -1,0 +1,69 @@
+"""Putting together what several agents saw: one file for each method of the paper's tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cobevglue.datasets.frame import did_you_mean
+from cobevglue.fusion.cobevglue import MaxFusion
+from cobevglue.fusion.early import EarlyFusion
+from cobevglue.fusion.f_cooper import FCooper
+from cobevglue.fusion.intermediate import FusionSample, IntermediateFusion, MultiScaleFusion, SingleMapFusion
+from cobevglue.fusion.late import LateFusion
+from cobevglue.fusion.method import FusionMethod, Received
+from cobevglue.fusion.none import NoCollaboration
+from cobevglue.perception import PointPillars
+
+__all__ = [
+    "FUSION_METHODS",
+    "FusionMethod",
+    "FusionSample",
+    "IntermediateFusion",
+    "MultiScaleFusion",
+    "Received",
+    "SingleMapFusion",
+    "fusion_class",
+    "pretrained_fusion",
+]
+
+FUSION_METHODS: dict[str, type[FusionMethod]] = {
+    "none": NoCollaboration,
+    "late": LateFusion,
+    "early": EarlyFusion,
+    "f-cooper": FCooper,
+    "cobevglue": MaxFusion,
+}
+"""From the name users type to the class, in the order of the paper's Table 1."""
+
+_WEIGHTS = Path(__file__).parent / "weights"
+
+
+def fusion_class(name: str) -> type[FusionMethod]:
+    """The class of this name in `FUSION_METHODS`.
+
+    Raises:
+        ValueError: there is none; names the nearest.
+    """
+    if name not in FUSION_METHODS:
+        raise ValueError(f"no fusion method {did_you_mean(name, FUSION_METHODS)}")
+    return FUSION_METHODS[name]
+
+
+def pretrained_fusion(name: str, detector: PointPillars, detector_name: str) -> FusionMethod:
+    """A method, with the weights that come with the package where it has any.
+
+    Args:
+        name: of the method.
+        detector: the encoder that it was trained on.
+        detector_name: its name among the pretrained.
+
+    Raises:
+        ValueError: there is no such method; or there are no weights of it for this detector.
+    """
+    method = fusion_class(name)(detector)  # type: ignore[call-arg]
+    if isinstance(method, IntermediateFusion):
+        path = _WEIGHTS / f"{detector_name}_{name}.safetensors"
+        if not path.is_file():
+            raise ValueError(f"no pretrained weights of {name!r} for the detector {detector_name!r}")
+        method.load(path)
+    return method

@@ -1,0 +1,215 @@
+"""What the methods that share feature maps have in common.
+
+The single-agent encoder stays as it is, what follows is trained for each method.
+
+The three maps of the backbone, one agent's each, are turned into what is shared (`share`), warped to the ego's frame,
+put together (`fuse_maps`) and decoded (`decode_maps`). A method is these three functions.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cobevglue.boxes import Boxes
+from cobevglue.fusion.method import FusionMethod, Received
+from cobevglue.fusion.warp import coverage, warp
+from cobevglue.messages import Arrays
+from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
+from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from cobevglue.perception.decode import decode
+from cobevglue.perception.head import HeadOutput
+from cobevglue.se2 import SE2
+
+__all__ = ["FusionSample", "IntermediateFusion", "MultiScaleFusion", "SingleMapFusion"]
+
+_LARGEST = 65504.0  # of float16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusionSample:
+    """What a method is trained on: one frame of some agents, the ego first.
+
+    Attributes:
+        seen: what each of the n agents saw, each in its own LiDAR frame.
+        ego_SE2_agent: n poses in the ego's frame, as the ego believes them; the first is the identity.
+        true_ego_SE2_agent: the same, true.
+        early_features: the three maps of the encoder for the merged cloud of all agents (by the true poses), for
+            DiscoNet's teacher; None where they are not known.
+    """
+
+    seen: Sequence[PerceptionOutput]
+    ego_SE2_agent: Sequence[SE2]
+    true_ego_SE2_agent: Sequence[SE2]
+    early_features: tuple[Tensor, Tensor, Tensor] | None = None
+
+
+class IntermediateFusion(FusionMethod, nn.Module):
+    """Shares feature maps. The neck and the head start as the detector's and are trained with the fusion.
+
+    Args:
+        detector: whose features are shared; it is not changed.
+
+    Attributes:
+        config: the detector's settings.
+        detection: how boxes are chosen, the detector's own settings at first.
+        training_noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose in training, as the
+            method's paper has it.
+    """
+
+    training_noise: ClassVar[tuple[float, float]] = (0.0, 0.0)
+
+    def __init__(self, detector: PointPillars) -> None:
+        nn.Module.__init__(self)
+        self.config = detector.config
+        self.detection = detector.detection
+        self.anchors = detector.anchors
+        self.neck = copy.deepcopy(detector.neck)
+        self.head = copy.deepcopy(detector.head)
+        self.metadata: dict[str, Any] = {}
+
+    @abstractmethod
+    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """From the encoder's maps of B agents, (B, C_i, H_i, W_i) at strides 2, 4, 8, to the maps that are sent."""
+
+    @abstractmethod
+    def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
+        """Put together what n agents shared.
+
+        Args:
+            maps: each (n, C, H, W), warped to the ego's frame, the ego first; 0 where an agent's map does not reach.
+            covered: of each map (n, 1, H, W), where it does reach: 1 inside, 0 outside.
+
+        Returns:
+            Maps (C, H, W), as `decode_maps` takes them.
+        """
+
+    @abstractmethod
+    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """From fused maps of B egos, each (B, C, H, W), to what is said of every anchor."""
+
+    def forward(self, samples: Sequence[FusionSample]) -> HeadOutput:
+        """What is said of every anchor in the ego's frame of each of B samples."""
+        return self.decode_maps(self.fused(samples))
+
+    def fused(self, samples: Sequence[FusionSample]) -> list[Tensor]:
+        """The fused maps, each (B, C, H, W), of B samples."""
+        agents = [seen for sample in samples for seen in sample.seen]
+        features = [torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)]
+        shared = self.share(features)
+        counts = [len(sample.seen) for sample in samples]
+        fused = [
+            self._fuse(maps, sample.ego_SE2_agent)
+            for sample, maps in zip(samples, zip(*(torch.split(m, counts) for m in shared), strict=True), strict=True)
+        ]
+        return [torch.stack(scale) for scale in zip(*fused, strict=True)]
+
+    def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
+        """Warp and fuse maps (n, C, H, W) of n agents, the ego first."""
+        others = ego_SE2_agent[1:]
+        warped = [torch.cat([m[:1], warp(m[1:], others, self.config)]) for m in maps]
+        covered = [torch.cat([torch.ones_like(m[:1, :1]), coverage(m[1:], others, self.config)]) for m in maps]
+        return self.fuse_maps(warped, covered)
+
+    def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
+        """What training minimises ("total"), and its parts for the log.
+
+        Args:
+            samples: B frames.
+            targets: what should be said of every anchor in each ego's frame.
+            loss: of a detector.
+        """
+        return loss(self(samples), targets)._asdict()
+
+    @torch.inference_mode()
+    def message(self, seen: PerceptionOutput) -> Arrays:
+        """The shared maps (C, H, W) in float16."""
+        shared = self.share([m[None] for m in seen.features])
+        return {f"map{i}": _half(m[0]) for i, m in enumerate(shared)}
+
+    def received_maps(self, content: Arrays) -> list[Tensor]:
+        """What `message` has sent, as maps (C, H, W)."""
+        return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(len(content))]
+
+    @torch.inference_mode()
+    def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
+        """The boxes that the decoder finds in the fused maps."""
+        own = self.share([m[None] for m in ego.features])
+        others = [self.received_maps(other.content) for other in received]
+        maps = [torch.cat([m, *(o[i][None].to(m) for o in others)]) for i, m in enumerate(own)]
+        fused = self._fuse(maps, [SE2(), *(other.ego_SE2_other for other in received)])
+        ((boxes, _),) = decode(self.decode_maps([m[None] for m in fused]), self.anchors, self.detection)
+        return boxes
+
+    def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
+        """Write the weights and what is known of them (as JSON can hold it) to one safetensors file.
+
+        Args:
+            path: where to; the file appears complete or not at all.
+            metadata: data, metrics, seed, the encoder's fingerprint.
+            half: in float16, for half the size.
+        """
+        config = json.loads(self.config.model_dump_json())
+        save_checkpoint(path, self.architecture(), config, self, {**self.metadata, **(metadata or {})}, half)
+
+    def load(self, path: str | Path) -> Self:
+        """Take the weights that `save` wrote; in evaluation mode afterwards.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is damaged, of another method, or for a detector with other settings.
+        """
+        checkpoint = load_checkpoint(path, self.architecture())
+        own = json.loads(self.config.model_dump_json(exclude={"detection"}))
+        differing = [name for name, value in own.items() if checkpoint.config.get(name) != value]
+        if differing:
+            raise ValueError(f"{path}: for a detector with other settings: {', '.join(differing)}")
+        load_weights(self, checkpoint.weights, path)
+        self.metadata = checkpoint.metadata
+        return self.eval()
+
+    @classmethod
+    def architecture(cls) -> str:
+        """What a file of weights calls this method."""
+        return f"fusion {cls.__name__}"
+
+
+class MultiScaleFusion(IntermediateFusion):
+    """Shares the encoder's three maps as they are, fuses each, and decodes them as the detector does."""
+
+    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """The maps themselves."""
+        return list(features)
+
+    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """The neck and the head."""
+        output: HeadOutput = self.head(self.neck(maps))
+        return output
+
+
+class SingleMapFusion(IntermediateFusion):
+    """Shares the one map at stride 2 that the neck makes of the three."""
+
+    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """The neck's map."""
+        return [self.neck(features)]
+
+    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """The head."""
+        output: HeadOutput = self.head(maps[0])
+        return output
+
+
+def _half(values: Tensor) -> NDArray[np.float16]:
+    rounded: NDArray[np.float16] = values.clamp(-_LARGEST, _LARGEST).to("cpu", torch.float16).numpy()
+    return rounded

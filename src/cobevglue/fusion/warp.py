@@ -1,0 +1,56 @@
+"""Equation (1c) of CoBEVGlue: another agent's bird's-eye-view maps, seen in the ego's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cobevglue.perception.config import PointPillarsConfig
+from cobevglue.se2 import SE2
+
+__all__ = ["coverage", "warp"]
+
+
+def warp(maps: Tensor, ego_SE2_others: Sequence[SE2], config: PointPillarsConfig) -> Tensor:
+    """Maps of other agents, moved to where the ego has them.
+
+    A cell of the result is what lies, in the other's map, where the centre of the ego's cell is: bilinear between the
+    four nearest cells, 0 outside.
+
+    Args:
+        maps: (B, C, H, W) of B agents, each in its own frame, covering the detector's range at any stride; rows are y,
+            columns are x, both from min to max.
+        ego_SE2_others: B poses of the others in the ego's frame.
+        config: the detector's settings, for the range.
+
+    Returns:
+        (B, C, H, W) in the ego's frame.
+    """
+    if not len(maps):
+        return maps
+    theta = torch.from_numpy(np.stack([_normalised(pose, config) for pose in ego_SE2_others]))
+    grid = F.affine_grid(theta.to(maps.device, maps.dtype), list(maps.shape), align_corners=False)
+    return F.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+
+
+def coverage(maps: Tensor, ego_SE2_others: Sequence[SE2], config: PointPillarsConfig) -> Tensor:
+    """(B, 1, H, W) how much of each of the ego's cells the other agents' maps cover, 0 to 1."""
+    return warp(torch.ones_like(maps[:, :1]), ego_SE2_others, config)
+
+
+def _normalised(ego_SE2_other: SE2, config: PointPillarsConfig) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """(2, 3) from the ego's to the other's coordinates, both scaled to -1..1 over the range: what `affine_grid` takes.
+
+    As the range is longer than it is wide, a turn in metres is a turn with a shear in these coordinates.
+    """
+    (x_min, x_max), (y_min, y_max) = config.x_range, config.y_range
+    centre = np.array([x_min + x_max, y_min + y_max]) / 2.0
+    half = np.array([x_max - x_min, y_max - y_min]) / 2.0
+    other_SE2_ego = ego_SE2_other.inverse()
+    rotation = other_SE2_ego.rotation
+    shift = rotation @ centre + other_SE2_ego.translation - centre
+    return np.column_stack([rotation * half[None, :] / half[:, None], shift / half])

@@ -1,0 +1,100 @@
+"""Named arrays as bytes: how feature maps, points, scored boxes and poses travel.
+
+Layout of version 1, little endian throughout:
+
+| bytes | type    | content                                            |
+|-------|---------|----------------------------------------------------|
+| 4     | bytes   | magic, `CBVA`                                      |
+| 1     | uint8   | version, 1                                         |
+| 1     | uint8   | how many arrays follow                             |
+| 4     | uint32  | after the arrays: CRC-32 (zlib's) of all before it |
+
+and of each array: length of its name (uint8), the name (UTF-8), type (uint8), number of dimensions (uint8), shape
+(uint32 each), and the numbers in C order.
+
+The length of these bytes is the communication volume of what is shared for fusion. What is rounded before (features to
+float16) is up to the sender; nothing is compressed.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cobevglue.messages.object_message import MessageError
+
+__all__ = ["Arrays", "decode_arrays", "encode_arrays"]
+
+Arrays = Mapping[str, NDArray[Any]]
+"""What travels, by name."""
+
+_MAGIC, _VERSION = b"CBVA", 1
+_HEADER = struct.Struct("<4sBB")
+_CHECKSUM = struct.Struct("<I")
+_TYPES = [np.dtype(name) for name in ("<f2", "<f4", "<f8", "u1", "<u2", "<u4", "i1", "<i2", "<i4", "<i8")]
+
+
+def encode_arrays(arrays: Arrays) -> bytes:
+    """The bytes of some arrays, in the layout that this module's docstring describes.
+
+    Raises:
+        MessageError: too many arrays, too long a name, or a type that does not travel.
+    """
+    if len(arrays) > 255:
+        raise MessageError(f"{len(arrays)} arrays, a message holds at most 255")
+    parts = [_HEADER.pack(_MAGIC, _VERSION, len(arrays))]
+    for name, array in arrays.items():
+        text = name.encode("utf-8")
+        dtype = array.dtype.newbyteorder("<") if array.dtype.byteorder == ">" else array.dtype
+        if dtype not in _TYPES or not 1 <= len(text) <= 255 or array.ndim > 255:
+            raise MessageError(f"array {name!r} of {array.dtype} with {array.ndim} dimensions does not travel")
+        shape = struct.pack(f"<BB{array.ndim}I", _TYPES.index(dtype), array.ndim, *array.shape)
+        parts += [bytes([len(text)]), text, shape, np.ascontiguousarray(array, dtype).tobytes()]
+    body = b"".join(parts)
+    return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
+def decode_arrays(data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays in these bytes, read-only.
+
+    Raises:
+        MessageError: these are not exactly one undamaged message of a known version.
+    """
+    end = len(data) - _CHECKSUM.size
+    if end < _HEADER.size:
+        raise MessageError(f"truncated: {len(data)} bytes, a message has at least {_HEADER.size + _CHECKSUM.size}")
+    magic, version, count = _HEADER.unpack_from(data)
+    if magic != _MAGIC or version != _VERSION:
+        raise MessageError(f"not an array message of version {_VERSION}: it starts with {data[:5]!r}")
+    if zlib.crc32(data[:end]) != _CHECKSUM.unpack_from(data, end)[0]:
+        raise MessageError("corrupted: the checksum does not match")
+    try:
+        arrays, offset = _read(data[:end], count)
+    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
+        raise MessageError(f"invalid: {error}") from None
+    if offset != end or len(arrays) != count:
+        raise MessageError("invalid: bytes left over, or two arrays of one name")
+    return arrays
+
+
+def _read(data: bytes, count: int) -> tuple[dict[str, NDArray[Any]], int]:
+    arrays: dict[str, NDArray[Any]] = {}
+    offset = _HEADER.size
+    for _ in range(count):
+        length = data[offset]
+        name = data[offset + 1 : offset + 1 + length].decode("utf-8")
+        offset += 1 + length
+        kind, dimensions = struct.unpack_from("<BB", data, offset)
+        shape = struct.unpack_from(f"<{dimensions}I", data, offset + 2)
+        offset += 2 + 4 * dimensions
+        size = math.prod(shape)
+        array = np.frombuffer(data, _TYPES[kind], count=size, offset=offset) if size else np.zeros(0, _TYPES[kind])
+        arrays[name] = array.reshape(shape)
+        offset += array.nbytes
+    return arrays, offset

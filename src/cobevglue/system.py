@@ -1,0 +1,195 @@
+"""The whole system: equation (1) of CoBEVGlue, one line a step.
+
+system = CoBEVGlue.pretrained("compact", fusion="cobevglue", aligner="bevglue")
+out = system.step({"car1": points1, "car2": points2}, ego="car1", time=0.0)
+out.boxes, out.alignments["car2"], out.message_bytes["car2"]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from cobevglue.alignment import Alignment, group_aligner
+from cobevglue.alignment.group import GroupAligner, Observation
+from cobevglue.boxes import Boxes, covers_origin
+from cobevglue.datasets.frame import did_you_mean
+from cobevglue.fusion import FusionMethod, Received, pretrained_fusion
+from cobevglue.messages import decode_arrays, encode_arrays
+from cobevglue.perception import Perception, PerceptionOutput, PointPillars
+from cobevglue.typing import ArrayLike, FloatArray
+
+__all__ = ["CoBEVGlue", "StepOutput"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepOutput:
+    """What the ego knows after one frame.
+
+    Attributes:
+        boxes: the vehicles around the ego, itself excluded, with score, in its LiDAR frame, best first.
+        alignments: the pose of every other agent, or why there is none; one that was refused took no part.
+        message_bytes: what each other agent sent, as encoded: {"boxes": …, "features": …}, and "points", "pose" or
+            "variance" where such things were sent.
+        alignment_bytes: the part of it that was sent for alignment.
+        seconds: time spent in each stage [s]; perception is the sum over agents.
+    """
+
+    boxes: Boxes
+    alignments: dict[str, Alignment]
+    message_bytes: dict[str, dict[str, int]]
+    alignment_bytes: dict[str, int]
+    seconds: dict[str, float]
+
+
+class CoBEVGlue:
+    """Several agents that see together.
+
+    All agents run the same detector; each has a tracker of its own. Agents may come and go from frame to frame.
+
+    Args:
+        detector: from points to features and boxes.
+        fusion: how what agents saw is put together.
+        aligner: where the poses of the others come from.
+    """
+
+    def __init__(self, detector: PointPillars, fusion: FusionMethod, aligner: GroupAligner) -> None:
+        self.detector, self.fusion, self.aligner = detector, fusion, aligner
+        self._perception: dict[str, Perception] = {}
+        self._ego: str | None = None
+        self._frame = 0
+
+    @classmethod
+    def pretrained(cls, name: str, fusion: str = "cobevglue", aligner: str | None = None) -> CoBEVGlue:
+        """The system on the weights that come with the package.
+
+        Args:
+            name: of the detector, "compact".
+            fusion: a name in `FUSION_METHODS`.
+            aligner: a name in `ALIGNERS`; None for the one that the method's paper has.
+
+        Raises:
+            ValueError: there is no such thing; names the nearest.
+        """
+        detector = PointPillars.pretrained(name)
+        method = pretrained_fusion(fusion, detector, name)
+        return cls(detector, method, group_aligner(aligner or method.usual_aligner))
+
+    def reset(self) -> None:
+        """Forget all tracks and poses: the next frame is the first of another drive."""
+        self._perception.clear()
+        self.aligner.reset()
+        self._ego, self._frame = None, 0
+
+    def step(
+        self,
+        points: Mapping[str, ArrayLike],
+        ego: str,
+        time: float | None = None,
+        poses: Mapping[str, ArrayLike] | None = None,
+    ) -> StepOutput:
+        """The next frame.
+
+        Args:
+            points: (N, 4) x, y, z [m], intensity of every agent's cloud, each in its own LiDAR frame.
+            ego: the agent whose view is asked for.
+            time: of the clouds [s]; by default 0.1 s after the last.
+            poses: (4, 4) world_SE3_lidar of every agent as its localisation claims, for aligners that need one.
+
+        Raises:
+            ValueError: no such ego, a cloud or pose of a wrong shape, or `time` not later than the last; names the
+                agent.
+        """
+        if ego not in points:
+            raise ValueError(f"ego: there is no agent {did_you_mean(ego, points)}")
+        start = perf_counter()
+        seen = {agent: self.perceive(agent, cloud, time) for agent, cloud in points.items()}  # (1a)
+        seconds = {"perception": perf_counter() - start}
+        return self.collaborate(seen, ego, time, poses, seconds)
+
+    def perceive(self, agent: str, points: ArrayLike, time: float | None = None) -> PerceptionOutput:
+        """Equation (1a): what one agent sees by itself. See `step` for the arguments."""
+        perception = self._perception.setdefault(agent, Perception(self.detector))
+        try:
+            return perception.step(points, time)
+        except ValueError as error:
+            raise ValueError(f"{agent}: {error}") from None
+
+    def collaborate(
+        self,
+        seen: Mapping[str, PerceptionOutput],
+        ego: str,
+        time: float | None = None,
+        poses: Mapping[str, ArrayLike] | None = None,
+        seconds: Mapping[str, float] | None = None,
+    ) -> StepOutput:
+        """Equations (1b) to (1e): from what each agent saw to what the ego knows. See `step` for the arguments."""
+        if ego != self._ego:  # poses of the others are remembered in the ego's frame
+            self.aligner.reset()
+            self._ego = ego
+        spent = dict(seconds or {})
+        sent: dict[str, dict[str, int]] = {agent: {"boxes": 0, "features": 0} for agent in seen if agent != ego}
+
+        with _timed("alignment", spent):
+            observations = self._observe(seen, ego, time, poses, sent)
+            alignments = self.aligner.align_group(ego, observations, time)  # (1b)
+        alignment_bytes = {agent: sum(parts.values()) for agent, parts in sent.items()}
+
+        with _timed("messages", spent):
+            received = []
+            for agent, alignment in alignments.items():
+                message = self.fusion.message(seen[agent])
+                data = encode_arrays(message) if message else b""
+                sent[agent][self.fusion.kind] = sent[agent].get(self.fusion.kind, 0) + len(data)
+                if alignment.ego_SE2_other is not None and message:
+                    received.append(Received(decode_arrays(data), alignment.ego_SE2_other))
+
+        with _timed("fusion", spent):
+            boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
+            boxes = boxes[~covers_origin(boxes)]  # others see the ego, too
+        self._frame += 1
+        return StepOutput(boxes, alignments, sent, alignment_bytes, spent)
+
+    def _observe(
+        self,
+        seen: Mapping[str, PerceptionOutput],
+        ego: str,
+        time: float | None,
+        poses: Mapping[str, ArrayLike] | None,
+        sent: dict[str, dict[str, int]],
+    ) -> dict[str, Observation]:
+        """What the aligner is given of every agent: of others, what arrived. Counts the bytes into `sent`."""
+        observations = {}
+        for agent, view in seen.items():
+            pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
+            whole = Observation(view.boxes, view.variance, view.points, view.features, pose)
+            try:
+                needed = self.aligner.look_at(whole)
+            except ValueError as error:
+                raise ValueError(f"{agent}: {error}") from None
+            if agent != ego:
+                parts = self.aligner.encode(agent, needed, 0.0 if time is None else time, self._frame)
+                needed = self.aligner.decode(parts, needed)
+                sent[agent].update({kind: len(data) for kind, data in parts.items()})
+            observations[agent] = needed
+        return observations
+
+
+def _pose(agent: str, poses: Mapping[str, ArrayLike]) -> FloatArray:
+    if agent not in poses:
+        raise ValueError(f"poses: {agent}: missing")
+    pose = np.asarray(poses[agent], dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"poses: {agent}: must be finite numbers of shape (4, 4), got shape {pose.shape}")
+    return pose
+
+
+@contextmanager
+def _timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = perf_counter()
+    yield
+    seconds[stage] = perf_counter() - start
