@@ -26,7 +26,7 @@ from cobevglue.fusion.method import FusionMethod, Received
 from cobevglue.fusion.warp import coverage, warp
 from cobevglue.messages import Arrays
 from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
-from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from cobevglue.perception.checkpoint import fingerprint, load_checkpoint, load_weights, save_checkpoint
 from cobevglue.perception.decode import decode
 from cobevglue.perception.head import HeadOutput
 from cobevglue.se2 import SE2
@@ -46,12 +46,14 @@ class FusionSample:
         true_ego_SE2_agent: the same, true.
         early_features: the three maps of the encoder for the merged cloud of all agents (by the true poses), for
             DiscoNet's teacher; None where they are not known.
+        truth: the objects to find, in the ego's LiDAR frame.
     """
 
     seen: Sequence[PerceptionOutput]
     ego_SE2_agent: Sequence[SE2]
     true_ego_SE2_agent: Sequence[SE2]
     early_features: tuple[Tensor, Tensor, Tensor] | None = None
+    truth: Boxes | None = None
 
 
 class IntermediateFusion(FusionMethod, nn.Module):
@@ -77,6 +79,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         self.neck = copy.deepcopy(detector.neck)
         self.head = copy.deepcopy(detector.head)
         self.metadata: dict[str, Any] = {}
+        self.encoder = fingerprint(detector)
 
     @abstractmethod
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
@@ -156,24 +159,27 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
         Args:
             path: where to; the file appears complete or not at all.
-            metadata: data, metrics, seed, the encoder's fingerprint.
+            metadata: data, metrics, seed; the detector's fingerprint is added.
             half: in float16, for half the size.
         """
         config = json.loads(self.config.model_dump_json())
-        save_checkpoint(path, self.architecture(), config, self, {**self.metadata, **(metadata or {})}, half)
+        known = {**self.metadata, **(metadata or {}), "encoder": self.encoder}
+        save_checkpoint(path, self.architecture(), config, self, known, half)
 
     def load(self, path: str | Path) -> Self:
         """Take the weights that `save` wrote; in evaluation mode afterwards.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, of another method, or for a detector with other settings.
+            ValueError: the file is damaged, of another method, or for another detector.
         """
         checkpoint = load_checkpoint(path, self.architecture())
         own = json.loads(self.config.model_dump_json(exclude={"detection"}))
         differing = [name for name, value in own.items() if checkpoint.config.get(name) != value]
         if differing:
             raise ValueError(f"{path}: for a detector with other settings: {', '.join(differing)}")
+        if checkpoint.metadata.get("encoder") != self.encoder:
+            raise ValueError(f"{path}: was trained on the features of another detector")
         load_weights(self, checkpoint.weights, path)
         self.metadata = checkpoint.metadata
         return self.eval()

@@ -5,6 +5,7 @@ Such a file holds numbers and text, no code: loading one from a stranger is safe
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 
 from cobevglue.datasets.whole_files import whole_file
 
-__all__ = ["Checkpoint", "load_checkpoint", "load_weights", "save_checkpoint"]
+__all__ = ["Checkpoint", "fingerprint", "load_checkpoint", "load_weights", "save_checkpoint"]
 
 _FORMAT = "1"
 """Raised when files of the version before can no longer be read."""
@@ -113,3 +114,12 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], path: str | P
         if not torch.isfinite(weights[name]).all():
             raise ValueError(f"{path}: weight {name!r} is not finite")
     module.load_state_dict(dict(weights))
+
+
+def fingerprint(module: nn.Module) -> str:
+    """16 hexadecimal digits that are the same for networks with the same weights, and for no others."""
+    digest = hashlib.sha256()
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
