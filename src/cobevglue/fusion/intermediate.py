@@ -30,6 +30,7 @@ from cobevglue.perception.checkpoint import fingerprint, load_checkpoint, load_w
 from cobevglue.perception.decode import decode
 from cobevglue.perception.head import HeadOutput
 from cobevglue.se2 import SE2
+from cobevglue.typing import FloatArray
 
 __all__ = ["FusionSample", "IntermediateFusion", "MultiScaleFusion", "SingleMapFusion"]
 
@@ -151,8 +152,12 @@ class IntermediateFusion(FusionMethod, nn.Module):
         others = [self.received_maps(other.content) for other in received]
         maps = [torch.cat([m, *(o[i][None].to(m) for o in others)]) for i, m in enumerate(own)]
         fused = self._fuse(maps, [SE2(), *(other.ego_SE2_other for other in received)])
-        ((boxes, _),) = decode(self.decode_maps([m[None] for m in fused]), self.anchors, self.detection)
+        ((boxes, _),) = self.boxes(self.decode_maps([m[None] for m in fused]))
         return boxes
+
+    def boxes(self, output: HeadOutput) -> list[tuple[Boxes, FloatArray]]:
+        """For each ego its K boxes, best first, and their (K, 3) variance of x, y [m^2] and yaw [rad^2]."""
+        return decode(output, self.anchors, self.detection)
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
         """Write the weights and what is known of them (as JSON can hold it) to one safetensors file.

@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import Field, ValidationError, field_validator
@@ -18,7 +18,7 @@ from cobevglue.settings import Settings
 from cobevglue.training.augmentation import AugmentationConfig
 from cobevglue.training.optimisation import OptimisationConfig
 
-__all__ = ["PRESETS", "DataConfig", "TrainDetectorConfig", "ValidationConfig", "load_config"]
+__all__ = ["PRESETS", "DataConfig", "TrainDetectorConfig", "ValidationConfig", "load_config", "settings_from"]
 
 SIMULATED = "simulated"
 """Name of the data that are made while training."""
@@ -154,18 +154,28 @@ def load_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainDetector
         ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
         FileNotFoundError: there is no such file.
     """
+    return settings_from(PRESETS, "compact", name_or_file, changes)
+
+
+Config = TypeVar("Config", bound=Settings)
+
+
+def settings_from(
+    presets: Mapping[str, Config], default: str, name_or_file: str, changes: Sequence[str] = ()
+) -> Config:
+    """See `load_config`; `default` is the preset of a file that names none."""
     overrides: dict[str, Any] = {}
     preset, where = name_or_file, ""
     if name_or_file.endswith((".yaml", ".yml")):
         overrides = _read_yaml(Path(name_or_file))
-        preset, where = str(overrides.pop("preset", "compact")), f"{name_or_file}: "
-    if preset not in PRESETS:
-        raise ValueError(f"{where}no preset {did_you_mean(preset, PRESETS)}")
-    values = _merged(PRESETS[preset].model_dump(), overrides)
+        preset, where = str(overrides.pop("preset", default)), f"{name_or_file}: "
+    if preset not in presets:
+        raise ValueError(f"{where}no preset {did_you_mean(preset, presets)}")
+    values = _merged(presets[preset].model_dump(), overrides)
     for change in changes:
         values = _merged(values, _one_change(change))
     try:
-        return TrainDetectorConfig.model_validate(values)
+        return type(presets[preset]).model_validate(values)
     except ValidationError as error:
         raise ValueError(where + _first_problem(error)) from None
 

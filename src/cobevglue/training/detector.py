@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -25,7 +25,7 @@ from cobevglue.training.checkpoint import (
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
 from cobevglue.training.optimisation import MeanWeights, learning_rate, make_optimizer
 from cobevglue.training.processes import Processes, process_group
-from cobevglue.training.run_log import RunLog, print_progress
+from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 from cobevglue.training.samples import EpisodeSource
 from cobevglue.training.sources import make_source
 from cobevglue.training.stream import EpisodeStream
@@ -217,7 +217,7 @@ class _Run:
     def _train_epoch(self, batches: Iterator[Batch], log: RunLog) -> None:
         config, optimisation, device = self.config, self.config.optimisation, self.processes.device
         self.net.train()
-        epoch, interval = _Meter(), _Meter()
+        epoch, interval = Meter(), Meter()
         first = self.epoch * self.batches_per_epoch
         for step in range(first, first + self.batches_per_epoch):
             asked = time.monotonic()
@@ -241,12 +241,12 @@ class _Run:
                 numbers = self._numbers(interval, step, rate)
                 log.add("train", step + 1, self.epoch, numbers)
                 self.report(self._progress(step + 1, numbers))
-                interval = _Meter()
+                interval = Meter()
         numbers = self._numbers(epoch, step, rate)
         log.add("epoch", step + 1, self.epoch, numbers)
         self.report(self._progress(step + 1, numbers))
 
-    def _numbers(self, meter: _Meter, step: int, rate: float) -> dict[str, float]:
+    def _numbers(self, meter: Meter, step: int, rate: float) -> dict[str, float]:
         numbers = meter.means()
         if not math.isfinite(numbers["total"]):
             raise DivergedError(
@@ -263,7 +263,7 @@ class _Run:
             f"epoch {self.epoch + 1}/{self.config.optimisation.epochs} step {step}/{self.steps}: {terms}, "
             f"lr {numbers['learning_rate']:.1e}, {numbers['samples_per_second']:.1f} samples/s "
             f"({100 * numbers['waiting']:.0f} % waiting for data), "
-            f"{_duration(samples / numbers['samples_per_second'])} left"
+            f"{duration(samples / numbers['samples_per_second'])} left"
         )
 
     def _validate(self, validation: Validation, log: RunLog) -> dict[str, float]:
@@ -323,31 +323,6 @@ class _Run:
         return DistributedDataParallel(model, device_ids=[self.processes.device] if cuda else None)
 
 
-@dataclass
-class _Meter:
-    """Means over steps. Sums stay on the device: asking a GPU for a number makes it wait."""
-
-    started: float = field(default_factory=time.monotonic)
-    sums: dict[str, torch.Tensor] = field(default_factory=dict)
-    steps: int = 0
-    samples: int = 0
-    waited: float = 0.0
-
-    def add(self, values: dict[str, torch.Tensor], samples: int, waited: float) -> None:
-        for name, value in values.items():
-            self.sums[name] = self.sums[name] + value if name in self.sums else value
-        self.steps, self.samples, self.waited = self.steps + 1, self.samples + samples, self.waited + waited
-
-    @property
-    def seconds(self) -> float:
-        return time.monotonic() - self.started
-
-    def means(self) -> dict[str, float]:
-        seconds = max(self.seconds, 1e-9)
-        terms = {name: float(value) / self.steps for name, value in self.sums.items()}
-        return {**terms, "samples_per_second": self.samples / seconds, "waiting": self.waited / seconds}
-
-
 def _start_from(model: PointPillars, path: Path) -> None:
     """Weights of an earlier run; other ranges and thresholds are fine, another network is not."""
     theirs, ours = PointPillars.load(path).state_dict(), model.state_dict()
@@ -359,8 +334,3 @@ def _start_from(model: PointPillars, path: Path) -> None:
     if wrong:
         raise ValueError(f"{path}: weights of another network; {len(wrong)} differ, the first is {wrong[0]}")
     model.load_state_dict(theirs)
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"

@@ -1,0 +1,315 @@
+"""The training of a fusion method on the frozen features of a detector: `train_fusion`. Minutes on a CPU."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
+from cobevglue.fusion import FUSION_METHODS, FusionSample, IntermediateFusion, fusion_class
+from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
+from cobevglue.se2 import SE2
+from cobevglue.settings import Settings
+from cobevglue.training.checkpoint import RunState, differing_keys, load_state, provenance, save_state
+from cobevglue.training.detector import DivergedError, TrainingResult
+from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
+from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, learning_rate, make_optimizer
+from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
+
+__all__ = ["FUSION_PRESETS", "TrainFusionConfig", "train_fusion"]
+
+_SAMPLE_STREAM = 90
+_STATE, _LAST = "state.pt", "last.safetensors"
+
+
+class TrainFusionConfig(Settings):
+    """Settings of `train_fusion`.
+
+    Attributes:
+        method: a name in `FUSION_METHODS` that shares features, or "disconet-teacher".
+        detector: whose features; a name of shipped weights, or a file of a run.
+        features: folder of the frozen features, shared by all methods; what is missing is computed first.
+        train: frames to train on.
+        validation: frames to validate on, after the last epoch.
+        alone: share of samples in which nobody but the ego is there.
+        noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose; None for what the method's
+            paper has.
+        teacher: weights of DiscoNet's teacher.
+        optimisation: how weights are found.
+        seed: of the first weights, the order of samples and their noise.
+        threads: of torch.
+        workers: processes that read samples.
+        report_every: time between lines of progress [s].
+    """
+
+    method: str
+    detector: str = "compact"
+    features: Path = Path("runs/fusion-features")
+    train: FeatureConfig = FeatureConfig()
+    validation: FeatureConfig = FeatureConfig(split="validation", scenarios=16)
+    alone: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
+    noise: tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]] | None = None
+    teacher: Path | None = None
+    optimisation: OptimisationConfig = OptimisationConfig(
+        epochs=2, samples_per_epoch=1000, learning_rate=1e-3, warm_up=0.05, mean_decay=0.99
+    )
+    seed: Annotated[int, Field(ge=0)] = 0
+    threads: Annotated[int, Field(ge=1)] = 2
+    workers: Annotated[int, Field(ge=0)] = 1
+    report_every: Annotated[float, Field(gt=0.0)] = 20.0
+
+
+FREE_TO_CHANGE = {"features", "threads", "workers", "report_every", "teacher"}
+"""A run may be resumed with other values of these."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Item:
+    sample: FusionSample
+    targets: Targets
+
+
+class _Samples(Dataset[_Item]):
+    """The samples of one epoch, made ready: frames in a new order, with poses as the ego believes them."""
+
+    def __init__(
+        self,
+        frames: FusionFrames,
+        order: Sequence[int],
+        noise: tuple[float, float],
+        alone: float,
+        seed: tuple[int, ...],
+        anchors: AnchorGrid,
+    ) -> None:
+        self._frames, self._order, self._noise, self._alone = frames, order, noise, alone
+        self._seed, self._anchors = seed, anchors
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __getitem__(self, index: int) -> _Item:
+        rng = np.random.default_rng([*self._seed, index])
+        frame = self._frames[self._order[index]]
+        agents = 1 if rng.random() < self._alone else len(frame.seen)
+        return _Item(
+            _sample(frame, agents, self._noise, rng),
+            assign_targets(
+                np.column_stack([frame.truth.center, frame.truth.size, frame.truth.yaw]), frame.ignored, self._anchors
+            ),
+        )
+
+
+def train_fusion(
+    config: TrainFusionConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    report: Callable[[str], None] = print_progress,
+) -> TrainingResult:
+    """Train what a method has beyond the encoder, or go on with a run that was interrupted.
+
+    Args:
+        config: settings.
+        folder: of the run; made where missing. State is saved after each epoch.
+        resume: go on with the run in `folder`.
+        report: takes lines of progress.
+
+    Raises:
+        ValueError: a method that has nothing to train; a folder that has a run already, or one with other settings.
+        FileNotFoundError: nothing to resume, or no such weights.
+        DivergedError: the loss is not finite any more.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.threads)
+    try:
+        return _train(config, folder, resume, report)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
+    optimisation = config.optimisation
+    detector = _detector(config.detector)
+    model = _make_model(config, detector)
+    state = load_state(folder / _STATE, torch.device("cpu")) if resume else None
+    _check(config, folder, state)
+    frames = write_features(config.features / config.train.split, config.train, detector, report)
+    validation = write_features(config.features / config.validation.split, config.validation, detector, report)
+
+    loss, anchors = DetectionLoss(detector.config), AnchorGrid(detector.config)
+    mean = MeanWeights(model, optimisation.mean_decay)
+    optimizer = make_optimizer(model, optimisation)
+    first, elapsed = 0, 0.0
+    if state is not None:
+        model.load_state_dict(state.model)
+        mean.model.load_state_dict(state.mean_model)
+        optimizer.load_state_dict(state.optimizer)
+        first, elapsed = state.epoch, state.elapsed
+    batches = optimisation.samples_per_epoch // optimisation.batch_size
+    noise = config.noise if config.noise is not None else model.training_noise
+    metrics: dict[str, float] = {}
+    folder.mkdir(parents=True, exist_ok=True)
+    with RunLog(folder, first * batches) as log:
+        for epoch in range(first, optimisation.epochs):
+            started = time.monotonic()
+            rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
+            rounds = -(-batches * optimisation.batch_size // len(frames))
+            order = np.concatenate([rng.permutation(len(frames)) for _ in range(rounds)])
+            order = order[: batches * optimisation.batch_size]
+            seed = (config.seed, _SAMPLE_STREAM, epoch)
+            samples = _Samples(frames, order.tolist(), noise, config.alone, seed, anchors)
+            _train_epoch(config, samples, model, mean, loss, optimizer, epoch, log, report)
+            if epoch + 1 == optimisation.epochs and len(validation):
+                metrics = _validate(mean.model, validation, report)
+                log.add("validation", (epoch + 1) * batches, epoch + 1, metrics)
+            elapsed += time.monotonic() - started
+            mean.model.save(folder / _LAST, _metadata(config, epoch + 1, elapsed, metrics))
+            content = config.model_dump(mode="json")
+            states = (model.state_dict(), mean.model.state_dict(), optimizer.state_dict())
+            save_state(folder / _STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
+    return TrainingResult(folder, optimisation.epochs, True, metrics, metrics.get("ap_0.7"))
+
+
+def _train_epoch(
+    config: TrainFusionConfig,
+    samples: _Samples,
+    model: IntermediateFusion,
+    mean: MeanWeights[IntermediateFusion],
+    loss: DetectionLoss,
+    optimizer: torch.optim.Optimizer,
+    epoch: int,
+    log: RunLog,
+    report: Callable[[str], None],
+) -> None:
+    optimisation = config.optimisation
+    loader = DataLoader(
+        samples,
+        batch_size=optimisation.batch_size,
+        num_workers=config.workers,
+        collate_fn=list,
+        prefetch_factor=2 if config.workers else None,
+        generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
+    )
+    model.train()
+    meter, whole = Meter(), Meter()
+    steps = optimisation.epochs * len(loader)
+    step = epoch * len(loader)
+    anchors = len(model.anchors)
+    asked = time.monotonic()
+    for items in loader:
+        waited = time.monotonic() - asked
+        rate = learning_rate(step, steps, optimisation)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        targets = collate_targets([item.targets for item in items], anchors)
+        terms = model.loss([item.sample for item in items], targets, loss)
+        optimizer.zero_grad(set_to_none=True)
+        terms["total"].backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(model.parameters(), optimisation.clip)
+        optimizer.step()
+        mean.update(model, step)
+        step += 1
+        for m in (meter, whole):
+            m.add({**{n: t.detach() for n, t in terms.items()}, "gradient": norm.detach()}, len(items), waited)
+        if meter.seconds >= config.report_every or step == (epoch + 1) * len(loader):
+            numbers = {**meter.means(), "learning_rate": rate}
+            if not math.isfinite(numbers["total"]):
+                raise DivergedError(f"the loss is {numbers['total']} at step {step}; lower optimisation.learning_rate")
+            log.add("train", step, epoch, numbers)
+            left = duration((steps - step) * optimisation.batch_size / whole.means()["samples_per_second"])
+            listed = " ".join(f"{name} {value:.3f}" for name, value in numbers.items())
+            report(
+                f"{config.method}: epoch {epoch + 1}/{optimisation.epochs} step {step}/{steps}: {listed}; {left} left"
+            )
+            meter = Meter()
+        asked = time.monotonic()
+
+
+def _validate(model: IntermediateFusion, frames: FusionFrames, report: Callable[[str], None]) -> dict[str, float]:
+    """AP in the detector's range on true poses; objects that are ignored in training are here, too."""
+    found = []
+    rng = np.random.default_rng(0)  # draws nothing: there is no noise
+    with torch.inference_mode():
+        for index in range(len(frames)):
+            frame = frames[index]
+            ((boxes, _),) = model.boxes(model([_sample(frame, len(frame.seen), (0.0, 0.0), rng)]))
+            counts = np.where(frame.ignored, 0, 1)
+            found.append(DetectionFrame(boxes, frame.truth, counts))
+    (x_min, x_max), (y_min, y_max) = model.config.x_range, model.config.y_range
+    result = evaluate_detections(
+        found, thresholds=(0.5, 0.7), evaluation_range=(x_min, x_max, y_min, y_max), min_points=1
+    )
+    metrics = {"ap_0.5": result.ap(0.5), "ap_0.7": result.ap(0.7)}
+    report("validated on true poses: " + " ".join(f"{name} {value:.3f}" for name, value in metrics.items()))
+    return metrics
+
+
+def _sample(frame: FusionFrame, agents: int, noise: tuple[float, float], rng: np.random.Generator) -> FusionSample:
+    """The first agents of a frame, with noise on every agent's pose, the ego's included."""
+    world_SE2_true = [SE2.from_matrix(pose) for pose in frame.world_SE3_agent[:agents]]
+    deviation = np.array([noise[0], noise[0], math.radians(noise[1])])
+    world_SE2_claimed = [
+        SE2(*(np.array([pose.x, pose.y, pose.yaw]) + rng.normal(size=3) * deviation)) for pose in world_SE2_true
+    ]
+
+    def seen_from_ego(world: Sequence[SE2]) -> list[SE2]:
+        return [SE2(), *(world[0].inverse() @ pose for pose in world[1:])]
+
+    return FusionSample(
+        seen=frame.seen[:agents],
+        ego_SE2_agent=seen_from_ego(world_SE2_claimed),
+        true_ego_SE2_agent=seen_from_ego(world_SE2_true),
+        early_features=frame.early_features if agents == len(frame.seen) else None,
+        truth=frame.truth[~frame.ignored],
+    )
+
+
+def _detector(name: str) -> PointPillars:
+    return PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+
+
+def _make_model(config: TrainFusionConfig, detector: PointPillars) -> IntermediateFusion:
+    made = fusion_class(config.method)
+    if not issubclass(made, IntermediateFusion):
+        raise ValueError(f"method: {config.method!r} has nothing to train")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return made(detector)
+
+
+def _check(config: TrainFusionConfig, folder: Path, state: RunState | None) -> None:
+    if state is None:
+        if (folder / _STATE).exists():
+            raise ValueError(f"{folder}: has a run already; resume it, or choose another folder")
+        return
+    differing = [
+        key
+        for key in differing_keys(state.config, config.model_dump(mode="json"))
+        if key.partition(".")[0] not in FREE_TO_CHANGE
+    ]
+    if differing:
+        raise ValueError(f"{folder}: the run was started with other settings: {', '.join(differing)}")
+
+
+def _metadata(config: TrainFusionConfig, epoch: int, elapsed: float, metrics: dict[str, float]) -> dict[str, object]:
+    known = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+    training = config.model_dump(mode="json")
+    return {**provenance(), "training": training, "epoch": epoch, "seconds": round(elapsed), "metrics": known}
+
+
+FUSION_PRESETS: dict[str, TrainFusionConfig] = {
+    name: TrainFusionConfig(method=name)
+    for name, method in FUSION_METHODS.items()
+    if issubclass(method, IntermediateFusion)
+}
+"""Shipped settings by the name of the method."""
