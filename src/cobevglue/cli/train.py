@@ -19,11 +19,14 @@ class Stage(str, Enum):
     """What can be trained."""
 
     DETECTOR = "detector"
+    FUSION = "fusion"
 
 
 def train(
     stage: Annotated[Stage, typer.Argument(help="What to train.")],
-    config: Annotated[str, typer.Option(help="Name of shipped settings, or a YAML file that overrides them.")],
+    config: Annotated[
+        str, typer.Option(help="Name of shipped settings (of fusion: the method), or a YAML file that overrides them.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/STAGE-CONFIG if left out.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in that folder.")] = False,
     changes: Annotated[
@@ -41,14 +44,19 @@ def train(
     start it with torchrun: torchrun --nproc-per-node 2 -m cobevglue train detector --config compact
     """
     try:
-        from cobevglue.training import DivergedError, load_config, train_detector
+        from cobevglue.training import DivergedError, load_config, load_fusion_config, train_detector, train_fusion
     except ImportError as error:
         raise InputError(" ".join(str(error).split())) from error
     folder = out if out is not None else Path("runs") / f"{stage.value}-{Path(config).stem}"
     try:
         with expected_errors():
-            settings = load_config(config, changes or ())
-            result = train_detector(settings, folder, resume=resume, max_minutes=max_minutes)
+            if stage is Stage.DETECTOR:
+                settings = load_config(config, changes or ())
+                result = train_detector(settings, folder, resume=resume, max_minutes=max_minutes)
+            else:
+                if max_minutes is not None:
+                    raise ValueError("--max-minutes: is for the detector; a fusion method takes minutes")
+                result = train_fusion(load_fusion_config(config, changes or ()), folder, resume=resume)
     except DivergedError as error:
         raise InputError(str(error)) from error
     except KeyboardInterrupt:

@@ -21,12 +21,13 @@ from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Target
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
 from cobevglue.training.checkpoint import RunState, differing_keys, load_state, provenance, save_state
+from cobevglue.training.config import settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
 from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, learning_rate, make_optimizer
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 
-__all__ = ["FUSION_PRESETS", "TrainFusionConfig", "train_fusion"]
+__all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
 
 _SAMPLE_STREAM = 90
 _STATE, _LAST = "state.pt", "last.safetensors"
@@ -313,3 +314,13 @@ FUSION_PRESETS: dict[str, TrainFusionConfig] = {
     if issubclass(method, IntermediateFusion)
 }
 """Shipped settings by the name of the method."""
+
+
+def load_fusion_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainFusionConfig:
+    """Settings by the name of a method or from a YAML file, with single values changed; see `load_config`.
+
+    Raises:
+        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
+        FileNotFoundError: there is no such file.
+    """
+    return settings_from(FUSION_PRESETS, "cobevglue", name_or_file, changes)
