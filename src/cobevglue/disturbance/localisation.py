@@ -1,0 +1,103 @@
+"""Localisation that is noisy, attacked, old or off: agents claim to be where they are not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from cobevglue.disturbance.disturbance import Disturbance, Moment, agent_rng
+from cobevglue.typing import FloatArray
+
+__all__ = ["LocalisationNoise", "OffsetPose", "ReplayedPose", "SamePlace"]
+
+_NOISE_STREAM = 70
+_Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class LocalisationNoise(Disturbance):
+    """Gaussian noise on the pose of every agent, the ego's included, anew in every moment (paper, section 6.2).
+
+    The same key gives the same noise at every level, but for its size: levels can be compared draw by draw.
+
+    Attributes:
+        position: standard deviation of x and of y [m].
+        yaw: standard deviation of the heading [degrees], as papers give it.
+    """
+
+    position: _Spread = 0.5
+    yaw: _Spread = 0.5
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Everyone claims a pose next to its own."""
+        now = moments[index]
+        claimed = {}
+        for agent, world_SE3_lidar in now.claimed.items():
+            x, y, turn = agent_rng(key, _NOISE_STREAM, index, agent).standard_normal(3)
+            noisy = _turned(math.radians(self.yaw * turn)) @ world_SE3_lidar
+            noisy[:3, 3] = world_SE3_lidar[:3, 3] + (self.position * x, self.position * y, 0.0)
+            claimed[agent] = noisy
+        return replace(now, claimed=claimed)
+
+
+class SamePlace(Disturbance):
+    """The attack of the paper: spoofed satellites make all collaborators believe they are where the ego is."""
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Everyone claims the ego's pose."""
+        now = moments[index]
+        return replace(now, claimed=dict.fromkeys(now.claimed, now.claimed[ego]))
+
+
+class ReplayedPose(Disturbance):
+    """Spoofed satellites play back an old recording: collaborators claim the pose of some time ago.
+
+    Attributes:
+        seconds: how old it is [s]; in the first moments of a drive, the first pose there is.
+    """
+
+    seconds: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 1.0
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Collaborators claim their old pose."""
+        now = moments[index]
+        claimed = dict(now.claimed)
+        for agent in now.collaborators(ego):
+            had = [moment for moment in moments[: index + 1] if agent in moment.claimed]
+            old = [moment for moment in had if moment.time <= now.time - self.seconds + 1e-6]
+            claimed[agent] = (old[-1] if old else had[0]).claimed[agent]
+        return replace(now, claimed=claimed)
+
+
+class OffsetPose(Disturbance):
+    """Collaborators are always off by the same, such as by a sensor that was never calibrated.
+
+    Attributes:
+        x: how much farther ahead of itself a collaborator believes to be [m].
+        y: how much farther to its left [m].
+        yaw: how much farther turned to its left [degrees].
+    """
+
+    x: _Finite = 3.0
+    y: _Finite = -2.0
+    yaw: _Finite = 3.0
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Collaborators claim a pose beside their own."""
+        now = moments[index]
+        lidar_SE3_believed = _turned(math.radians(self.yaw))
+        lidar_SE3_believed[:2, 3] = self.x, self.y
+        claimed = {agent: pose if agent == ego else pose @ lidar_SE3_believed for agent, pose in now.claimed.items()}
+        return replace(now, claimed=claimed)
+
+
+def _turned(yaw: float) -> FloatArray:
+    """(4, 4) turn about z."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    return turn

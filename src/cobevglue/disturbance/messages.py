@@ -1,0 +1,115 @@
+"""Messages that are made up, lost or late."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import Field
+
+from cobevglue.boxes import Boxes
+from cobevglue.disturbance.disturbance import Disturbance, Moment, agent_rng
+from cobevglue.messages import MAX_TRACK_ID
+
+if TYPE_CHECKING:
+    from cobevglue.perception import PerceptionOutput
+
+__all__ = ["Delay", "FabricatedBoxes", "MessageLoss"]
+
+_FABRICATED_STREAM, _LOSS_STREAM = 71, 72
+_CAR = (4.5, 1.9, 1.6)
+"""Length, width, height of a fabricated car [m]."""
+_GROUND = -1.0
+"""Height of its centre where a collaborator has no other box to go by [m]."""
+_SCORE = 0.9
+_VARIANCE = (0.01, 0.01, 0.001)
+"""Of x, y [m^2] and yaw [rad^2]: whoever makes up a box is sure of it."""
+
+
+class FabricatedBoxes(Disturbance):
+    """Every collaborator tells of cars that are not there; they stay with it, so that trackers believe in them, too.
+
+    They are added to its boxes and detections, not to its points and features.
+
+    Attributes:
+        count: how many.
+        reach: they are evenly spread around the collaborator as far as this [m].
+    """
+
+    count: Annotated[int, Field(ge=0, le=1000)] = 10
+    reach: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 40.0
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Collaborators tell more than they saw."""
+        now = moments[index]
+        seen = dict(now.seen)
+        for agent in now.collaborators(ego):
+            seen[agent] = self._with_more(seen[agent], agent_rng(key, _FABRICATED_STREAM, 0, agent))
+        return replace(now, seen=seen)
+
+    def _with_more(self, view: PerceptionOutput, rng: np.random.Generator) -> PerceptionOutput:
+        distance, bearing = self.reach * np.sqrt(rng.random(self.count)), rng.uniform(-math.pi, math.pi, self.count)
+        z = float(np.median(view.boxes.center[:, 2])) if len(view.boxes) else _GROUND
+        more = Boxes(
+            center=np.column_stack([distance * np.cos(bearing), distance * np.sin(bearing), np.full(self.count, z)]),
+            size=np.tile(_CAR, (self.count, 1)),
+            yaw=rng.uniform(-math.pi, math.pi, self.count),
+            score=np.full(self.count, _SCORE),
+            track_id=MAX_TRACK_ID - np.arange(self.count),
+            label=np.full(self.count, "car"),
+        )
+        detections = Boxes.concatenate([view.detections, more.replace(track_id=None)])
+        if detections.score is not None:
+            detections = detections[np.argsort(-detections.score, kind="stable")]
+        return replace(
+            view,
+            boxes=Boxes.concatenate([view.boxes, more]),
+            variance=np.concatenate([view.variance, np.tile(_VARIANCE, (self.count, 1))]),
+            detections=detections,
+        )
+
+
+class MessageLoss(Disturbance):
+    """Now and then nothing of a collaborator arrives.
+
+    Attributes:
+        probability: that this happens to one collaborator in one moment.
+    """
+
+    probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Some collaborators are missing."""
+        now = moments[index]
+        for agent in now.collaborators(ego):
+            if agent_rng(key, _LOSS_STREAM, index, agent).random() < self.probability:
+                now = now.without(agent)
+        return now
+
+
+class Delay(Disturbance):
+    """What collaborators tell arrives late: it is what they saw some time ago, and where they were then.
+
+    Before the first message arrives, and where a collaborator was not there at that time, there is nothing of it.
+
+    Attributes:
+        seconds: how late [s].
+    """
+
+    seconds: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
+
+    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+        """Collaborators as they were."""
+        now = moments[index]
+        sent = [moment for moment in moments[: index + 1] if moment.time <= now.time - self.seconds + 1e-6]
+        then = sent[-1] if sent else None
+        seen, claimed, true = dict(now.seen), dict(now.claimed), dict(now.true)
+        for agent in now.collaborators(ego):
+            if then is None or agent not in then.seen:
+                del seen[agent], claimed[agent], true[agent]
+            else:
+                seen[agent], claimed[agent], true[agent] = then.seen[agent], then.claimed[agent], then.true[agent]
+        return replace(now, seen=seen, claimed=claimed, true=true)
