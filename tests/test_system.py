@@ -1,0 +1,220 @@
+"""The five steps together, on the real OPV2V frames and on small made-up clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cobevglue import CoBEVGlue
+from cobevglue.alignment import ALIGNERS, Alignment, GroupAligner, Observation, group_aligner
+from cobevglue.boxes import covers_origin
+from cobevglue.datasets import OPV2V
+from cobevglue.datasets.poses import inverse_SE3
+from cobevglue.fusion import FUSION_METHODS, fusion_class
+from cobevglue.perception import PointPillars, PointPillarsConfig
+from cobevglue.se2 import SE2
+
+SMALL = PointPillarsConfig(
+    x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 8),
+    up_channels=8, shrink_channels=8,
+)  # fmt: skip
+
+
+def small_detector() -> PointPillars:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return PointPillars(SMALL).eval()
+
+
+def cloud(seed: int, count: int = 400) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.uniform([-12, -6, -2, 0], [12, 6, 0, 1], (count, 4)).astype(np.float32)
+
+
+def pose(x: float, y: float, yaw: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:2, :2] = SE2(x, y, yaw).rotation
+    matrix[:2, 3] = x, y
+    return matrix
+
+
+class Fixed(GroupAligner):
+    """Everyone stands where this says; those it does not name are refused."""
+
+    needs = frozenset({"boxes"})
+
+    def __init__(self, poses: Mapping[str, SE2]) -> None:
+        self.poses, self.seen = poses, {}
+
+    def align_group(
+        self, ego: str, observations: Mapping[str, Observation], time: float | None = None
+    ) -> dict[str, Alignment]:
+        self.seen = dict(observations)
+        names = [name for name in observations if name != ego]
+        return {n: Alignment(self.poses[n]) if n in self.poses else Alignment.refused("unknown") for n in names}
+
+
+@pytest.fixture(scope="module")
+def frames(request: pytest.FixtureRequest) -> list[tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]]:
+    """Clouds, true poses and times of three real frames."""
+    root: Path = request.getfixturevalue("culver_city")
+    scenario = OPV2V(root, split="test_culvercity")["TwoCars_1"]
+    chosen = [frame for frame in scenario if all(agent.points is not None for agent in frame.agents.values())][:3]
+    return [
+        (
+            {name: agent.points for name, agent in frame.agents.items()},
+            {name: agent.world_SE3_lidar for name, agent in frame.agents.items()},
+            frame.time,
+        )
+        for frame in chosen
+    ]
+
+
+@pytest.fixture(scope="module")
+def compact() -> PointPillars:
+    return PointPillars.pretrained("compact")
+
+
+def test_a_self_localised_system_gives_the_same_bytes_whatever_poses_are_claimed(frames, compact) -> None:
+    absurd = {"car1": pose(1e6, -4e5, 2.0), "car2": np.eye(4) * np.nan}
+    outputs = []
+    for poses in (None, "true", absurd):
+        system = CoBEVGlue(compact, fusion_class("cobevglue")(compact).eval(), group_aligner("bevglue"))
+        for clouds, true, time in frames:
+            out = system.step(clouds, "car1", time, true if poses == "true" else poses)
+            boxes = [out.boxes.center, out.boxes.size, out.boxes.yaw, out.boxes.score]
+            found = out.alignments["car2"].ego_SE2_other
+            outputs.append((len(outputs) % len(frames), b"".join(a.tobytes() for a in boxes), found))
+    for number in range(len(frames)):
+        same = [rest for n, *rest in outputs if n == number]
+        assert same[0] == same[1] == same[2]
+    assert outputs[-1][2] is not None
+
+
+def test_bevglue_finds_the_real_pose_and_others_see_what_the_ego_does_not(frames, compact) -> None:
+    system = CoBEVGlue(compact, fusion_class("late")(compact), group_aligner("bevglue"))
+    for clouds, poses, time in frames:
+        out = system.step(clouds, "car1", time)
+        true = SE2.from_matrix(inverse_SE3(poses["car1"]) @ poses["car2"])
+        found = out.alignments["car2"].ego_SE2_other
+        assert found is not None
+        assert found.error_to(true)[0] < 1.0
+        assert len(out.boxes) > 0
+        sent = out.message_bytes["car2"]
+        assert sent["features"] == 0
+        assert sent["boxes"] > out.alignment_bytes["car2"] > 0
+
+
+def test_the_bytes_of_the_feature_message_are_its_three_maps_in_float16() -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, fusion_class("cobevglue")(detector).eval(), Fixed({"b": SE2()}))
+    out = system.step({"a": cloud(1), "b": cloud(2)}, "a")
+    numbers = 8 * (16 * 32 + 8 * 16 + 4 * 8)
+    assert out.message_bytes["b"]["features"] == 2 * numbers + 6 + 4 + 3 * (1 + 4 + 2 + 12)
+    assert set(out.message_bytes) == {"b"}  # the ego sends nothing to itself
+
+
+@pytest.mark.parametrize("name", FUSION_METHODS)
+def test_whoever_is_refused_takes_no_part(name: str) -> None:
+    detector = small_detector()
+    alone, refused = (fusion_class(name)(detector) for _ in range(2))
+    for method in (alone, refused):
+        if isinstance(method, torch.nn.Module):
+            method.eval()
+    refused.load_state_dict(alone.state_dict()) if isinstance(refused, torch.nn.Module) else None
+    one = CoBEVGlue(detector, alone, Fixed({})).step({"a": cloud(1)}, "a")
+    two = CoBEVGlue(detector, refused, Fixed({})).step({"a": cloud(1), "b": cloud(2)}, "a")
+    assert not two.alignments["b"].accepted
+    np.testing.assert_array_equal(one.boxes.bev, two.boxes.bev)
+    np.testing.assert_array_equal(one.boxes.score, two.boxes.score)
+
+
+@pytest.mark.parametrize("name", FUSION_METHODS)
+def test_every_method_takes_any_number_of_agents_and_empty_clouds(name: str) -> None:
+    detector = small_detector()
+    method = fusion_class(name)(detector)
+    if isinstance(method, torch.nn.Module):
+        method.eval()
+    poses = {"b": SE2(3.0, 1.0, 0.2), "c": SE2(-4.0, 0.0, 3.0), "d": SE2(0.0, 2.0, -1.0)}
+    system = CoBEVGlue(detector, method, Fixed(poses))
+    for clouds in (
+        {"a": cloud(1)},
+        {"a": cloud(1), "b": cloud(2), "c": cloud(3), "d": cloud(4)},
+        {"a": cloud(1), "b": np.zeros((0, 4), np.float32)},
+        {"a": np.zeros((0, 4), np.float32), "c": cloud(3)},
+    ):
+        out = system.step(clouds, "a")
+        assert out.boxes.score is not None
+        assert np.isfinite(out.boxes.bev).all()
+        assert (np.diff(out.boxes.score) <= 0).all()
+        assert set(out.alignments) == set(out.message_bytes) == set(clouds) - {"a"}
+
+
+def test_the_ego_is_not_among_its_boxes() -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, fusion_class("late")(detector), Fixed({}))
+    out = system.step({"a": cloud(5, 3000)}, "a")
+    found = detector.detect(cloud(5, 3000))
+    assert len(out.boxes) == len(found) - int(covers_origin(found).sum())
+
+
+def test_an_aligner_is_given_what_it_needs_and_nothing_else() -> None:
+    detector = small_detector()
+    aligner = Fixed({})
+    system = CoBEVGlue(detector, fusion_class("none")(detector), aligner)
+    system.step({"a": cloud(1), "b": cloud(2)}, "a", poses={"a": np.eye(4), "b": np.eye(4)})
+    for seen in aligner.seen.values():
+        assert seen.boxes is not None
+        assert (seen.pose, seen.points, seen.features, seen.variance) == (None, None, None, None)
+
+
+def test_given_localisation_is_the_relative_pose_of_the_claims() -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, fusion_class("late")(detector), group_aligner("given"))
+    claims = {"a": pose(100.0, 50.0, 1.0), "b": pose(110.0, 50.0, 1.5)}
+    out = system.step({"a": cloud(1), "b": cloud(2)}, "a", poses=claims)
+    expected = SE2(100.0, 50.0, 1.0).inverse() @ SE2(110.0, 50.0, 1.5)
+    found = out.alignments["b"].ego_SE2_other
+    assert found is not None
+    assert found.error_to(expected) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert out.message_bytes["b"]["pose"] == out.alignment_bytes["b"]
+
+
+def test_agents_come_and_go_and_another_ego_starts_afresh() -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, fusion_class("cobevglue")(detector).eval(), group_aligner("bevglue"))
+    for number, (names, ego) in enumerate([("ab", "a"), ("a", "a"), ("abc", "a"), ("bc", "b")]):
+        out = system.step({name: cloud(ord(name)) for name in names}, ego, time=0.1 * number)
+        assert set(out.alignments) == set(names) - {ego}
+    system.reset()
+    system.step({"a": cloud(1)}, "a", time=0.0)  # an earlier time is fine after a reset
+
+
+@pytest.mark.parametrize(
+    ("clouds", "ego", "poses", "problem"),
+    [
+        ({"car1": cloud(1)}, "car2", None, "ego: there is no agent 'car2'; did you mean 'car1'"),
+        ({"car1": cloud(1), "car2": cloud(2)[:, :3]}, "car1", None, "car2: points must have shape"),
+        ({"car1": cloud(1), "car2": cloud(2)}, "car1", None, "car1: GivenLocalisation needs pose of every agent"),
+        ({"car1": cloud(1), "car2": cloud(2)}, "car1", {"car1": np.eye(4)}, "poses: car2: missing"),
+        ({"car1": cloud(1)}, "car1", {"car1": np.eye(3)}, "poses: car1: must be finite numbers of shape"),
+        ({"car1": cloud(1)}, "car1", {"car1": np.full((4, 4), np.nan)}, "poses: car1: must be finite"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_the_agent(clouds, ego, poses, problem) -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, fusion_class("late")(detector), group_aligner("given"))
+    with pytest.raises(ValueError, match=problem):
+        system.step(clouds, ego, poses=poses)
+
+
+def test_unknown_names_are_told_the_nearest() -> None:
+    with pytest.raises(ValueError, match=r"'cobevglu'; did you mean 'cobevglue'"):
+        CoBEVGlue.pretrained("compact", fusion="cobevglu")
+    with pytest.raises(ValueError, match=r"'bevgleu'; did you mean 'bevglue'"):
+        CoBEVGlue.pretrained("compact", fusion="none", aligner="bevgleu")
+    assert set(ALIGNERS) >= {"bevglue", "given"}
