@@ -48,7 +48,7 @@ class TrainFusionConfig(Settings):
         teacher: weights of DiscoNet's teacher.
         optimisation: how weights are found.
         seed: of the first weights, the order of samples and their noise.
-        threads: of torch.
+        threads: of torch; as many processes make features.
         workers: processes that read samples.
         report_every: time between lines of progress [s].
     """
@@ -144,8 +144,10 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
     model = _make_model(config, detector)
     state = load_state(folder / _STATE, torch.device("cpu")) if resume else None
     _check(config, folder, state)
-    frames = write_features(config.features / config.train.split, config.train, detector, report)
-    validation = write_features(config.features / config.validation.split, config.validation, detector, report)
+    frames, validation = (
+        write_features(config.features / wanted.split, wanted, detector, report, config.threads)
+        for wanted in (config.train, config.validation)
+    )
 
     loss, anchors = DetectionLoss(detector.config), AnchorGrid(detector.config)
     mean = MeanWeights(model, optimisation.mean_decay)

@@ -7,8 +7,12 @@ encoder's maps in float16, detections, points, true poses, and the objects to fi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -132,7 +136,11 @@ class FusionFrames:
 
 
 def write_features(
-    folder: Path, config: FeatureConfig, detector: PointPillars, report: Callable[[str], None] = print_progress
+    folder: Path,
+    config: FeatureConfig,
+    detector: PointPillars,
+    report: Callable[[str], None] = print_progress,
+    processes: int = 1,
 ) -> FusionFrames:
     """Compute features, or what is missing of them; a finished folder of the same settings is taken as it is.
 
@@ -141,6 +149,8 @@ def write_features(
         config: which frames.
         detector: in evaluation mode.
         report: takes lines of progress.
+        processes: how many make drives side by side, with one thread each; features differ in
+            their last digit between one and many.
 
     Raises:
         ValueError: the folder was made with other settings or another detector.
@@ -154,15 +164,28 @@ def write_features(
     write_json(started, wanted)
     if not (folder / "index.json").is_file():
         files: list[str] = []
-        for number in range(config.scenarios):
-            files += _write_scenario(folder, number, config, detector)
-            if number % 10 == 9 or number + 1 == config.scenarios:
-                report(f"features of {number + 1} of {config.scenarios} drives, {len(files)} frames")
+        with _map(processes) as mapped:
+            drives = mapped(partial(_write_scenario, folder, config, detector), range(config.scenarios))
+            for number, names in enumerate(drives, start=1):
+                files += names
+                if number % 10 == 0 or number == config.scenarios:
+                    report(f"features of {number} of {config.scenarios} drives, {len(files)} frames")
         write_json(folder / "index.json", {**wanted, "files": files})
     return FusionFrames(folder)
 
 
-def _write_scenario(folder: Path, number: int, config: FeatureConfig, detector: PointPillars) -> list[str]:
+@contextmanager
+def _map(processes: int) -> Iterator[Callable[[Callable[[int], list[str]], range], Iterable[list[str]]]]:
+    """`map`, in this process or in several."""
+    if processes == 1:
+        yield map
+    else:
+        fresh = get_context("spawn")  # a forked process inherits torch's threads in whatever state they are
+        with ProcessPoolExecutor(processes, fresh, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield pool.map
+
+
+def _write_scenario(folder: Path, config: FeatureConfig, detector: PointPillars, number: int) -> list[str]:
     done = folder / f"{number:04d}.json"
     if not done.is_file():
         files = []
