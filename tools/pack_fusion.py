@@ -66,7 +66,8 @@ backbone are frozen and not in these files; a file names the detector that it be
 - **Data**: simulated drives of the `train` networks only (SUMO traffic, embreex LiDAR; 2 or 3 agents), made by the
   command; no real cloud was used. Truth: objects that all agents together have at least 5 points on.
 - **Command**: `cobevglue train fusion --config METHOD --out runs/fusion/METHOD`, then
-  `python tools/pack_fusion.py {detector} runs/fusion`. Settings, commit, seed, machine and time are in each file's header.
+  `python tools/pack_fusion.py {detector} runs/fusion`. Settings, commit, seed, machine and time are in each file's
+  header.
 - **Poses in training**: true ones with Gaussian noise on every agent (column *noise*), as the method's paper has it.
   One sample in five has nobody but the ego in it.
 - **AP** below: 96 frames of the `validation` networks on true poses, objects with at least 5 points, range of the
