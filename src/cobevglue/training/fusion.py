@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.fusion import FUSION_METHODS, FusionSample, IntermediateFusion, fusion_class
+from cobevglue.fusion.disconet import DiscoNet, EarlyTeacher
 from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
@@ -28,6 +29,9 @@ from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, lea
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 
 __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
+
+TEACHER = "disconet-teacher"
+"""In the place of a method's name: what DiscoNet learns from."""
 
 _SAMPLE_STREAM = 90
 _STATE, _LAST = "state.pt", "last.safetensors"
@@ -45,7 +49,7 @@ class TrainFusionConfig(Settings):
         alone: share of samples in which nobody but the ego is there.
         noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose; None for what the method's
             paper has.
-        teacher: weights of DiscoNet's teacher.
+        teacher: weights of DiscoNet's teacher; None for none.
         optimisation: how weights are found.
         seed: of the first weights, the order of samples and their noise.
         threads: of torch; as many processes make features.
@@ -282,12 +286,15 @@ def _detector(name: str) -> PointPillars:
 
 
 def _make_model(config: TrainFusionConfig, detector: PointPillars) -> IntermediateFusion:
-    made = fusion_class(config.method)
+    made = EarlyTeacher if config.method == TEACHER else fusion_class(config.method)
     if not issubclass(made, IntermediateFusion):
         raise ValueError(f"method: {config.method!r} has nothing to train")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return made(detector)
+        model = made(detector)
+    if isinstance(model, DiscoNet) and config.teacher is not None:
+        model.teacher = EarlyTeacher(detector).load(config.teacher)
+    return model
 
 
 def _check(config: TrainFusionConfig, folder: Path, state: RunState | None) -> None:
@@ -315,6 +322,10 @@ FUSION_PRESETS: dict[str, TrainFusionConfig] = {
     for name, method in FUSION_METHODS.items()
     if issubclass(method, IntermediateFusion)
 }
+FUSION_PRESETS[TEACHER] = TrainFusionConfig(method=TEACHER)
+FUSION_PRESETS["disconet"] = TrainFusionConfig(
+    method="disconet", teacher=Path("runs/fusion") / TEACHER / "last.safetensors"
+)
 """Shipped settings by the name of the method."""
 
 
