@@ -6,7 +6,7 @@ import zlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -37,8 +37,12 @@ class Moment:
 
     def without(self, agent: str) -> Moment:
         """The same, but nothing of this agent."""
-        tables = {name: _without(getattr(self, name), agent) for name in ("seen", "claimed", "true")}
-        return replace(self, **tables)
+        return replace(
+            self,
+            seen=_without(self.seen, agent),
+            claimed=_without(self.claimed, agent),
+            true=_without(self.true, agent),
+        )
 
     def collaborators(self, ego: str) -> list[str]:
         """All agents but the ego."""
@@ -75,5 +79,8 @@ def agent_rng(key: Sequence[int], stream: int, index: int, agent: str) -> np.ran
     return np.random.default_rng([*key, stream, index, zlib.crc32(agent.encode())])
 
 
-def _without(table: Mapping[str, object], agent: str) -> dict[str, object]:
+_Value = TypeVar("_Value")
+
+
+def _without(table: Mapping[str, _Value], agent: str) -> dict[str, _Value]:
     return {name: value for name, value in table.items() if name != agent}

@@ -1,0 +1,68 @@
+"""One way to run the system over the drives of a study: a fusion method, a source of poses, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from cobevglue.alignment import ALIGNERS, BEVGlueConfig, group_aligner
+from cobevglue.alignment.group import GroupAligner
+from cobevglue.datasets.frame import did_you_mean
+from cobevglue.disturbance import Disturbance, disturbance
+from cobevglue.settings import Settings
+
+__all__ = ["Condition"]
+
+
+class Condition(Settings):
+    """How the system is run. Equal conditions have equal keys, whatever process made them.
+
+    Attributes:
+        fusion: name of the fusion method.
+        aligner: name of the source of poses.
+        aligner_options: its arguments; of "bevglue", fields of `BEVGlueConfig`.
+        disturbance: name of what goes wrong.
+        disturbance_options: its settings.
+        true_poses: aligners that need poses are given the true ones, whatever agents claim: the oracle.
+        forget: the aligner forgets everything after each frame.
+        every: only every so many frames are run.
+
+    Raises:
+        ValueError: no such aligner, disturbance or option (names the nearest), or a value out of its range.
+    """
+
+    fusion: str
+    aligner: str
+    aligner_options: dict[str, Any] = Field(default_factory=dict)
+    disturbance: str = "none"
+    disturbance_options: dict[str, float] = Field(default_factory=dict)
+    true_poses: bool = False
+    forget: bool = False
+    every: Annotated[int, Field(ge=1)] = 1
+
+    def model_post_init(self, _: Any) -> None:
+        """Refuse what could not be run, before anything is."""
+        if self.aligner not in ALIGNERS:
+            raise ValueError(f"no aligner {did_you_mean(self.aligner, ALIGNERS)}")
+        self.make_disturbance()
+
+    @property
+    def key(self) -> str:
+        """All of it as one line of JSON."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+
+    def make_aligner(self) -> GroupAligner:
+        """An aligner that has seen nothing yet.
+
+        Raises:
+            ValueError: it does not take these options.
+        """
+        if self.aligner == "bevglue":
+            return group_aligner("bevglue", config=BEVGlueConfig(**self.aligner_options))
+        return group_aligner(self.aligner, **self.aligner_options)
+
+    def make_disturbance(self) -> Disturbance:
+        """What goes wrong."""
+        return disturbance(self.disturbance, **self.disturbance_options)

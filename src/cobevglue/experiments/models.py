@@ -1,0 +1,92 @@
+"""The networks of a study, made once in each process."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from cobevglue.experiments.study import StudySettings
+from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion
+from cobevglue.perception import PointPillars
+
+__all__ = ["Models"]
+
+
+class Models:
+    """The detector and the fusion methods of a study.
+
+    Args:
+        settings: which ones.
+
+    Attributes:
+        detector: in evaluation mode, on a GPU where there is one.
+
+    Raises:
+        ValueError: no such detector (names the nearest), or a damaged file.
+        FileNotFoundError: there is no such file.
+    """
+
+    def __init__(self, settings: StudySettings) -> None:
+        self._settings = settings
+        name = settings.detector
+        detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+        self.detector = detector.to("cuda" if torch.cuda.is_available() else "cpu")
+        self._methods: dict[str, FusionMethod] = {}
+
+    @property
+    def evaluation_range(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max [m] of what counts: whole metres, a pillar inside of what the detector sees."""
+        config = self.detector.config
+        inside = 1e-6 - config.pillar
+        (x_min, x_max), (y_min, y_max) = config.x_range, config.y_range
+        return (
+            -math.floor(inside - x_min),
+            math.floor(inside + x_max),
+            -math.floor(inside - y_min),
+            math.floor(inside + y_max),
+        )
+
+    def method(self, name: str) -> FusionMethod:
+        """The fusion method of this name.
+
+        Raises:
+            ValueError: there is none, or it has no weights for this detector.
+            FileNotFoundError: the folder of weights does not have them.
+        """
+        if name not in self._methods:
+            method = self._make(name)
+            if isinstance(method, nn.Module):
+                method.to(self.detector.device).eval()
+            self._methods[name] = method
+        return self._methods[name]
+
+    def _make(self, name: str) -> FusionMethod:
+        settings = self._settings
+        if not settings.untrained and settings.weights is None:
+            return pretrained_fusion(name, self.detector, settings.detector)
+        method = fusion_class(name)(self.detector)  # type: ignore[call-arg]
+        if isinstance(method, IntermediateFusion) and settings.weights is not None:
+            method.load(Path(settings.weights) / f"{name}.safetensors")
+        return method
+
+    def fingerprint(self, name: str) -> str:
+        """Of a method's weights: changes when they do, and with them what it gives."""
+        method = self.method(name)
+        return _fingerprint(method if isinstance(method, nn.Module) else self.detector)
+
+    @property
+    def detector_fingerprint(self) -> str:
+        """The same of the detector."""
+        return _fingerprint(self.detector)
+
+
+def _fingerprint(module: nn.Module) -> str:
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

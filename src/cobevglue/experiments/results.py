@@ -1,0 +1,227 @@
+"""What came out of one drive under some conditions, in memory and on disk.
+
+A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with everything but boxes; `boxes`, the
+(M, 8) detections x, y, z, l, w, h [m], yaw [rad], score of all conditions and frames in the document's order; and
+`truth`, the (K, 7) true boxes of all frames. It is written as a whole, and nothing in it is code.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.whole_files import whole_file
+from cobevglue.experiments.condition import Condition
+from cobevglue.typing import FloatArray, IntArray
+
+__all__ = ["ConditionResult", "FrameResult", "FrameTruth", "Heard", "ScenarioResult", "read_result", "write_result"]
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One collaborator in one frame.
+
+    Attributes:
+        agent: its name.
+        translation_error: of its pose [m]; infinite where it was refused.
+        yaw_error: of its pose, magnitude [rad]; infinite where it was refused.
+        landing_error: how far its boxes lie from where the true pose puts them [m]; infinite where it was refused.
+        reason: why its pose was refused; "" where it was accepted.
+        message_bytes: what it sent, by kind.
+        alignment_bytes: the part of it that was sent for alignment.
+    """
+
+    agent: str
+    translation_error: float
+    yaw_error: float
+    landing_error: float
+    reason: str
+    message_bytes: dict[str, int]
+    alignment_bytes: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether its pose was used."""
+        return math.isfinite(self.translation_error)
+
+    def success(self, k: float) -> bool:
+        """Accepted, within k metres and k degrees."""
+        return self.translation_error < k and self.yaw_error < math.radians(k)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    """What the ego concluded in one frame: boxes with scores in its LiDAR frame, from whom, and the time [s]."""
+
+    boxes: Boxes
+    heard: tuple[Heard, ...]
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTruth:
+    """The truth of one frame.
+
+    Attributes:
+        timestamp: name of the frame.
+        objects: K vehicles that any agent could see, in the ego's LiDAR frame.
+        point_count: (K,) points of all agents together on each of them.
+        co_visible: by collaborator, how many of them both it and the ego detected.
+        seconds: of perception's stages, summed over agents [s].
+    """
+
+    timestamp: str
+    objects: Boxes
+    point_count: IntArray
+    co_visible: dict[str, int]
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConditionResult:
+    """A drive under one condition.
+
+    Attributes:
+        condition: which one.
+        fingerprint: of the method's weights.
+        frames: by the number of the frame in the result's truth.
+    """
+
+    condition: Condition
+    fingerprint: str
+    frames: dict[int, FrameResult]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenarioResult:
+    """A drive under all conditions.
+
+    Attributes:
+        scenario: name of the drive.
+        ego: who looks; "" where no frame had a vehicle with a cloud.
+        truth: of every frame that was used.
+        left_out: what was not used, and how often: "agents without a cloud", "frames without the ego".
+        conditions: by their keys.
+    """
+
+    scenario: str
+    ego: str
+    truth: list[FrameTruth]
+    left_out: dict[str, int]
+    conditions: dict[str, ConditionResult] = field(default_factory=dict)
+
+
+def write_result(path: Path, result: ScenarioResult) -> None:
+    """Write the file; it appears complete or not at all."""
+    truth = [
+        {
+            "timestamp": one.timestamp,
+            "objects": len(one.objects),
+            "labels": None if one.objects.label is None else one.objects.label.tolist(),
+            "point_count": one.point_count.tolist(),
+            "co_visible": one.co_visible,
+            "seconds": one.seconds,
+        }
+        for one in result.truth
+    ]
+    conditions = [
+        {
+            "condition": run.condition.model_dump(mode="json"),
+            "fingerprint": run.fingerprint,
+            "frames": [
+                {
+                    "frame": index,
+                    "boxes": len(frame.boxes),
+                    "heard": [_finite(asdict(heard)) for heard in frame.heard],
+                    "seconds": frame.seconds,
+                }
+                for index, frame in run.frames.items()
+            ],
+        }
+        for run in result.conditions.values()
+    ]
+    document = {
+        "format": _FORMAT,
+        "scenario": result.scenario,
+        "ego": result.ego,
+        "left_out": result.left_out,
+        "truth": truth,
+        "conditions": conditions,
+    }
+    detections = [frame.boxes for run in result.conditions.values() for frame in run.frames.values()]
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            document=np.frombuffer(json.dumps(document, allow_nan=False).encode(), np.uint8),
+            boxes=_rows(detections, 8).astype(np.float32),
+            truth=_rows([one.objects for one in result.truth], 7),
+        )
+
+
+def read_result(path: Path) -> ScenarioResult:
+    """Read what `write_result` wrote.
+
+    Raises:
+        ValueError: the file is damaged, or of something else; names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            document = json.loads(file["document"].tobytes())
+            boxes, truth = file["boxes"].astype(np.float64), file["truth"]
+        if document["format"] != _FORMAT:
+            raise ValueError(f"format {document['format']}, this version of cobevglue reads format {_FORMAT}")
+        return _result(document, boxes, truth)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: damaged, or no result of a drive: {error}") from None
+
+
+def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -> ScenarioResult:
+    truths, row = [], 0
+    for one in document["truth"]:
+        objects = _boxes(truth[row : row + one["objects"]], one["labels"])
+        counts = np.array(one["point_count"], np.int64)
+        truths.append(FrameTruth(one["timestamp"], objects, counts, one["co_visible"], one["seconds"]))
+        row += one["objects"]
+    conditions, row = {}, 0
+    for one in document["conditions"]:
+        frames = {}
+        for frame in one["frames"]:
+            heard = tuple(Heard(**_infinite(part)) for part in frame["heard"])
+            frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), heard, frame["seconds"])
+            row += frame["boxes"]
+        condition = Condition(**one["condition"])
+        conditions[condition.key] = ConditionResult(condition, one["fingerprint"], frames)
+    return ScenarioResult(document["scenario"], document["ego"], truths, document["left_out"], conditions)
+
+
+def _rows(parts: Sequence[Boxes], width: int) -> FloatArray:
+    """(M, width) numbers of all boxes."""
+    rows = [np.zeros((0, width))]
+    for boxes in parts:
+        score = [boxes.score] if boxes.score is not None else [np.zeros(len(boxes))]
+        rows.append(np.column_stack([boxes.center, boxes.size, boxes.yaw, *score])[:, :width])
+    return np.concatenate(rows)
+
+
+def _boxes(rows: FloatArray, labels: list[str] | None = None) -> Boxes:
+    score = rows[:, 7] if rows.shape[1] == 8 else None
+    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], score, label=labels)
+
+
+def _finite(record: dict[str, Any]) -> dict[str, Any]:
+    """Errors of a refused pose are infinite, which JSON does not know: null."""
+    return {k: None if isinstance(v, float) and math.isinf(v) else v for k, v in record.items()}
+
+
+def _infinite(record: dict[str, Any]) -> dict[str, Any]:
+    return {k: math.inf if v is None else v for k, v in record.items()}

@@ -1,0 +1,165 @@
+"""One drive under many conditions. Perception is run once, and each method's messages are made once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from time import perf_counter
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.datasets.frame import Scenario
+from cobevglue.disturbance import Disturbance, Moment
+from cobevglue.evaluation.alignment import landing_error
+from cobevglue.experiments.condition import Condition
+from cobevglue.experiments.drive import Drive
+from cobevglue.experiments.models import Models
+from cobevglue.experiments.results import ConditionResult, FrameResult, Heard, ScenarioResult
+from cobevglue.experiments.study import StudySettings, drive_frames
+from cobevglue.fusion import FusionMethod, Received
+from cobevglue.messages import Arrays
+from cobevglue.perception import PerceptionOutput
+from cobevglue.se2 import SE2
+from cobevglue.system import CoBEVGlue, StepOutput
+
+__all__ = ["PERCEPTION_COST", "MessageMemo", "run_drive"]
+
+PERCEPTION_COST = 10
+"""What seeing a frame costs, in conditions of that frame; for the estimate of the time that is left."""
+_BLOCK = 20
+"""So many frames are in memory at a time, and as many before them: all that a disturbance may look back to."""
+
+_Progress = Callable[[float], None]
+
+
+def run_drive(
+    settings: StudySettings,
+    drive: Scenario,
+    number: int,
+    conditions: Sequence[Condition],
+    models: Models,
+    progress: _Progress = lambda work: None,
+) -> ScenarioResult:
+    """Go through a drive under all conditions.
+
+    Args:
+        settings: of the study.
+        drive: the frames; consecutive.
+        number: of the drive in the study, for random numbers.
+        conditions: with keys that differ.
+        models: the networks.
+        progress: called with the work that was done, in frames of one condition.
+
+    Raises:
+        ValueError: a broken file; names it.
+    """
+    seeing = Drive(models.detector)
+    memos = {condition.fusion: MessageMemo(models.method(condition.fusion)) for condition in conditions}
+    runs = [_Run(condition, models, memos[condition.fusion], (settings.seed, number)) for condition in conditions]
+    runs.sort(key=lambda run: list(memos).index(run.condition.fusion))  # so that only one memo is full at a time
+    frames = iter(drive_frames(settings, drive))
+    while block := list(islice(frames, _BLOCK)):
+        new = seeing.see(block)
+        progress(PERCEPTION_COST * len(block))
+        fusion = ""
+        for run in runs:
+            if run.condition.fusion != fusion:
+                fusion = run.condition.fusion
+                for memo in memos.values():
+                    memo.clear()
+            for index in new:
+                run.step(seeing, index)
+            progress(len(block) / run.condition.every)
+        for memo in memos.values():
+            memo.clear()
+        seeing.forget_views(before=new.start)
+    return ScenarioResult(
+        drive.name,
+        seeing.ego,
+        seeing.truth,
+        dict(seeing.left_out),
+        {
+            run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition.fusion), run.frames)
+            for run in runs
+        },
+    )
+
+
+class _Run:
+    """A condition on its way through a drive."""
+
+    def __init__(self, condition: Condition, models: Models, memo: MessageMemo, key: tuple[int, ...]) -> None:
+        self.condition = condition
+        self.frames: dict[int, FrameResult] = {}
+        self._memo = memo
+        self._system = CoBEVGlue(models.detector, memo, condition.make_aligner())
+        self._disturbance: Disturbance = condition.make_disturbance()
+        self._key = key
+
+    def step(self, drive: Drive, index: int) -> None:
+        """The next frame."""
+        if index % self.condition.every:
+            return
+        moment = self._disturbance.apply(drive.moments, index, drive.ego, self._key)
+        if self.condition.forget:
+            self._system.aligner.reset()
+        poses = moment.true if self.condition.true_poses else moment.claimed
+        self._memo.saved = 0.0
+        out = self._system.collaborate(moment.seen, drive.ego, moment.time, poses)
+        out.seconds["messages"] += self._memo.saved
+        self.frames[index] = FrameResult(_numbers(out.boxes), tuple(_heard(moment, drive.ego, out)), out.seconds)
+
+
+def _heard(moment: Moment, ego: str, out: StepOutput) -> Iterator[Heard]:
+    for agent, alignment in out.alignments.items():
+        translation = yaw = landing = math.inf
+        if alignment.ego_SE2_other is not None:
+            truth = SE2.from_matrix(np.linalg.inv(moment.true[ego]) @ moment.true[agent])
+            translation, yaw = alignment.ego_SE2_other.error_to(truth)
+            landing = landing_error(alignment.ego_SE2_other, truth, moment.seen[agent].boxes)
+        yield Heard(
+            agent, translation, yaw, landing, alignment.reason, out.message_bytes[agent], out.alignment_bytes[agent]
+        )
+
+
+def _numbers(boxes: Boxes) -> Boxes:
+    """The boxes without what is not kept."""
+    return boxes.replace(label=None, track_id=None)
+
+
+class MessageMemo(FusionMethod):
+    """A fusion method that makes the message of a view only once.
+
+    Args:
+        method: whose messages and boxes these are.
+
+    Attributes:
+        saved: time that messages which were not made again had taken [s]; may be set to 0 at any time.
+    """
+
+    def __init__(self, method: FusionMethod) -> None:
+        self._method = method
+        self.kind = method.kind  # type: ignore[misc]  # as this method has it
+        self.saved = 0.0
+        self._made: dict[int, tuple[PerceptionOutput, Arrays, float]] = {}
+
+    def clear(self) -> None:
+        """Forget the messages."""
+        self._made.clear()
+
+    def message(self, seen: PerceptionOutput) -> Arrays:
+        """The method's message."""
+        if id(seen) in self._made:
+            _, message, seconds = self._made[id(seen)]
+            self.saved += seconds
+            return message
+        start = perf_counter()
+        message = self._method.message(seen)
+        self._made[id(seen)] = seen, message, perf_counter() - start  # what is kept keeps its id
+        return message
+
+    def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
+        """The method's boxes."""
+        return self._method.fuse(ego, received)

@@ -1,0 +1,267 @@
+"""Runs a study: a file for each drive, several processes or a Ray cluster, and an interrupted run goes on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from cobevglue import __version__
+from cobevglue.datasets.whole_files import write_json
+from cobevglue.experiments.condition import Condition
+from cobevglue.experiments.models import Models
+from cobevglue.experiments.results import ConditionResult, ScenarioResult, read_result, write_result
+from cobevglue.experiments.run import PERCEPTION_COST, run_drive
+from cobevglue.experiments.study import StudySettings, drive_names, open_drive
+
+__all__ = ["run_study"]
+
+_STUDY_FILE = "study.json"
+_PATIENCE = 0.2  # between two looks at how far the workers are [s]
+
+_Progress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A drive, and the conditions that it is still to be run under."""
+
+    settings: StudySettings
+    number: int
+    conditions: tuple[Condition, ...]
+
+
+def run_study(
+    settings: StudySettings,
+    conditions: Sequence[Condition],
+    folder: str | Path,
+    *,
+    workers: int = 1,
+    use_ray: bool = False,
+    progress: _Progress = lambda done, total: None,
+) -> list[ScenarioResult]:
+    """Run every drive of a study under every condition, or take from `folder` what was run before.
+
+    The results are the same with any number of workers, but for the times.
+
+    Args:
+        settings: the data and the networks.
+        conditions: any that are equal are run once.
+        folder: where the files are; made if it is not there.
+        workers: processes; with 1 it is done in this one.
+        use_ray: run on the Ray cluster that RAY_ADDRESS names, or on one of `workers` processes on this machine.
+        progress: called with the work that is done and that there is in all, in frames of one condition.
+
+    Returns:
+        The results of all drives in order.
+
+    Raises:
+        ValueError: bad settings, no such data, or the folder has results of another study; says what differs.
+        FileNotFoundError: the data or weights are not there.
+        ModuleNotFoundError: something is not installed: the simulation, or Ray.
+    """
+    names = drive_names(settings)
+    models = Models(settings)
+    unique = list({condition.key: condition for condition in conditions}.values())
+    for condition in unique:
+        condition.make_aligner()
+    fingerprints = {condition.key: models.fingerprint(condition.fusion) for condition in unique}
+    _claim(Path(folder), settings, models.detector_fingerprint)
+
+    paths = [Path(folder) / f"{number:04d}_{_file_name(name)}.npz" for number, name in enumerate(names)]
+    jobs = []
+    for number, path in enumerate(paths):
+        there = read_result(path).conditions if path.exists() else {}
+        missing = [c for c in unique if c.key not in there or there[c.key].fingerprint != fingerprints[c.key]]
+        if missing:
+            jobs.append(_Job(settings, number, tuple(missing)))
+    work = _run_here if workers == 1 and not use_ray else _run_with_ray if use_ray else _run_in_processes
+    with _closing(work(jobs, workers, models, progress)) as results:
+        for job, result in results:
+            path = paths[job.number]
+            if path.exists():
+                old = read_result(path)
+                result = replace(result, conditions={**old.conditions, **result.conditions})
+            write_result(path, result)
+    return [_only(read_result(path), fingerprints) for path in paths]
+
+
+def _claim(folder: Path, settings: StudySettings, detector: str) -> None:
+    """Make the folder that of this study, or refuse one of another."""
+    study = {"version": __version__, "detector_weights": detector, **settings.model_dump(mode="json")}
+    # What does not change results: how many drives there are, and where fusion weights are; those have fingerprints.
+    for name in ("scenarios", "weights", "untrained"):
+        del study[name]
+    path = folder / _STUDY_FILE
+    if not path.exists():
+        write_json(path, study, indent=2)
+        return
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        differing = [name for name in {**study, **before} if before.get(name) != study.get(name)]
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"{path}: damaged: {error}") from None
+    if differing:
+        pairs = [f"{name} {before.get(name)!r}, not {study.get(name)!r}" for name in differing]
+        raise ValueError(f"{folder}: has results of another study ({'; '.join(pairs)}); choose another folder")
+
+
+def _only(result: ScenarioResult, fingerprints: Mapping[str, str]) -> ScenarioResult:
+    """The conditions that were asked for."""
+    wanted: dict[str, ConditionResult] = {key: result.conditions[key] for key in fingerprints}
+    return replace(result, conditions=wanted)
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name)
+
+
+_Results = Iterator[tuple[_Job, ScenarioResult]]
+
+
+def _run_here(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
+    """In this process."""
+    import torch
+
+    total, done = _work_of(jobs), 0.0
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums do not depend on how many there are
+    try:
+        for job in jobs:
+            finished = [done]
+
+            def report(work: float, finished: list[float] = finished) -> None:
+                finished[0] += work
+                progress(finished[0], total)
+
+            yield job, _run(job, models, report)
+            done = finished[0]
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run_in_processes(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
+    """In some processes on this machine."""
+    context = get_context("spawn")  # a fork does not get on with threads
+    reports: Any = context.Queue()
+    stop = context.Event()
+    total, done = _work_of(jobs), 0.0
+    with _single_threaded(), ProcessPoolExecutor(workers, context, _start_worker, (reports, stop)) as pool:
+        pending: dict[Future[ScenarioResult], _Job] = {pool.submit(_run_in_worker, job): job for job in jobs}
+        try:
+            while pending:
+                finished, _ = wait(pending, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                done += _drained(reports)
+                progress(done, total)
+                for future in finished:
+                    yield pending.pop(future), future.result()
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _run_with_ray(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
+    """On a Ray cluster. Data sets and weights must be at the same paths on all of its machines."""
+    try:
+        import ray
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("Ray is not installed: pip install 'cobevglue[cluster]'") from None
+    address = os.environ.get("RAY_ADDRESS")
+    options = {"address": address} if address else {"num_cpus": workers, "include_dashboard": False}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+    total, done = _work_of(jobs), 0.0
+    try:
+        task = ray.remote(num_cpus=1)(_run_in_worker)
+        pending = {task.remote(job): job for job in jobs}
+        progress(done, total)
+        while pending:
+            (finished, *_), _ = ray.wait(list(pending), num_returns=1)
+            job = pending.pop(finished)
+            yield job, ray.get(finished)
+            done += _work_of([job])
+            progress(done, total)
+    finally:
+        ray.shutdown()
+
+
+_worker_reports: Any = None
+_worker_stop: Any = None
+
+
+def _start_worker(reports: Any, stop: Any) -> None:
+    """In a new process, once."""
+    global _worker_reports, _worker_stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; the first one stops us
+    _worker_reports, _worker_stop = reports, stop
+
+
+def _run_in_worker(job: _Job) -> ScenarioResult:
+    """In a process of its own."""
+    import torch
+
+    torch.set_num_threads(1)
+
+    def report(work: float) -> None:
+        if _worker_stop is not None and _worker_stop.is_set():
+            raise InterruptedError("stopped")
+        if _worker_reports is not None:
+            _worker_reports.put(work)
+
+    return _run(job, Models(job.settings), report)
+
+
+def _run(job: _Job, models: Models, report: Callable[[float], None]) -> ScenarioResult:
+    drive = open_drive(job.settings, job.number)
+    return run_drive(job.settings, drive, job.number, job.conditions, models, report)
+
+
+def _work_of(jobs: Sequence[_Job]) -> float:
+    """Frames of one condition, as far as this is known before the drives are gone through."""
+    total = 0.0
+    for job in jobs:
+        frames = len(open_drive(job.settings, job.number))
+        frames = min(frames, job.settings.frames or frames)
+        total += frames * (PERCEPTION_COST + sum(1.0 / condition.every for condition in job.conditions))
+    return total
+
+
+def _drained(reports: Any) -> float:
+    """What workers have done since the last look."""
+    work = 0.0
+    while not reports.empty():
+        work += reports.get()
+    return work
+
+
+@contextmanager
+def _closing(results: Any) -> Iterator[_Results]:
+    try:
+        yield results
+    finally:
+        results.close()
+
+
+@contextmanager
+def _single_threaded() -> Iterator[None]:
+    """Processes that are started meanwhile compute in one thread each."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

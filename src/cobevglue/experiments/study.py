@@ -1,0 +1,111 @@
+"""What a study is run on: the drives of a data set or simulated ones, and the networks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, field_validator
+
+from cobevglue.datasets import DATASETS
+from cobevglue.datasets.frame import Frame, Scenario, did_you_mean
+from cobevglue.settings import Settings
+
+__all__ = ["SEED", "SIMULATED", "StudySettings", "drive_frames", "drive_names", "open_drive"]
+
+SIMULATED = "simulated"
+"""In the place of a data set's name: drives that are made on the way."""
+SEED = 2406
+"""Of simulated drives and of everything that goes wrong in them; nothing was trained, tuned or tried on this one."""
+
+_SIMULATED_DRIVES, _SIMULATED_FRAMES = 20, 20
+_AGENTS = (2, 3)
+"""Of simulated drives, in turn."""
+
+_Count = Annotated[int, Field(ge=1)]
+
+
+class StudySettings(Settings):
+    """The data and the networks: everything but the conditions that they are run under.
+
+    Attributes:
+        dataset: name in `DATASETS`, or "simulated".
+        root: of the data set; None for simulated drives.
+        split: name of the split.
+        scenarios: so many at most; None for all, 20 of simulated ones.
+        frames: of each scenario, from its beginning, so many at most; None for all, 20 of simulated ones.
+        seed: of all that is random.
+        detector: a shipped model's name, or a .safetensors file.
+        weights: folder with the weights of fusion methods, `<name>.safetensors`; None for those that are shipped.
+        untrained: take methods as they are made, without any weights: with the detector's own neck and head.
+        min_points: objects on which all agents together have fewer points are ignored.
+
+    Raises:
+        ValueError: no such data set (names the nearest), or a value out of its range.
+    """
+
+    dataset: str = SIMULATED
+    root: str | None = None
+    split: str = "test"
+    scenarios: _Count | None = None
+    frames: _Count | None = None
+    seed: Annotated[int, Field(ge=0)] = SEED
+    detector: str = "compact"
+    weights: str | None = None
+    untrained: bool = False
+    min_points: Annotated[int, Field(ge=0)] = 5
+
+    @field_validator("dataset")
+    @classmethod
+    def _known(cls, dataset: str) -> str:
+        if dataset != SIMULATED and dataset not in DATASETS:
+            raise ValueError(f"no data set {did_you_mean(dataset, [SIMULATED, *DATASETS])}")
+        return dataset
+
+    @property
+    def label(self) -> str:
+        """What tables call the data."""
+        return f"{self.dataset} {self.split}"
+
+
+def drive_names(settings: StudySettings) -> list[str]:
+    """The drives that a study goes through.
+
+    Raises:
+        ValueError: the data set has no root, or simulated ones have one; or no such split.
+        FileNotFoundError: there is no such data set at the root.
+        ModuleNotFoundError: the simulation is not installed.
+    """
+    if settings.dataset == SIMULATED:
+        if settings.root is not None:
+            raise ValueError("simulated drives have no root: they are made on the way")
+        return [_simulated(settings, number).name for number in range(settings.scenarios or _SIMULATED_DRIVES)]
+    if settings.root is None:
+        raise ValueError(f"the data set {settings.dataset} needs a root, the folder where it is")
+    names = DATASETS[settings.dataset](Path(settings.root), settings.split).scenarios
+    if not names:
+        raise ValueError(f"{settings.root}: the split {settings.split!r} has no scenarios")
+    return list(names[: settings.scenarios])
+
+
+def open_drive(settings: StudySettings, number: int) -> Scenario:
+    """Drive `number` of `drive_names`; nothing is read or simulated before a frame is used."""
+    if settings.dataset == SIMULATED:
+        return _simulated(settings, number)
+    dataset = DATASETS[settings.dataset](Path(settings.root or "."), settings.split)
+    return dataset[dataset.scenarios[number]]
+
+
+def drive_frames(settings: StudySettings, drive: Scenario) -> Iterator[Frame]:
+    """The frames of a drive that a study looks at."""
+    return islice(iter(drive), settings.frames)
+
+
+def _simulated(settings: StudySettings, number: int) -> Scenario:
+    from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenario
+
+    agents = _AGENTS[number % len(_AGENTS)]
+    drive = ScenarioSettings(frames=settings.frames or _SIMULATED_FRAMES, agents=agents)
+    return simulated_scenario(settings.split, number, settings.seed, drive)

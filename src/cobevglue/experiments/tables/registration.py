@@ -1,0 +1,106 @@
+"""Figure 4 of the paper: average precision against communication, for BEVGlue and for registration of points."""
+
+from __future__ import annotations
+
+from cobevglue.alignment import ALIGNERS
+from cobevglue.alignment.group import GroupAligner
+from cobevglue.experiments.condition import Condition
+from cobevglue.experiments.measure import Results, pose_quality
+from cobevglue.experiments.table import Cell, Table
+from cobevglue.experiments.tables.scope import Experiment, Scope, aligner_title, as_is, method_title
+
+__all__ = ["REGISTRATION", "registration_points"]
+
+
+def _levels(scope: Scope, aligner: str) -> list[float | None]:
+    """Of the initial pose; None for what needs none."""
+    kind = ALIGNERS[aligner]
+    needs_pose = issubclass(kind, GroupAligner) and "pose" in kind.needs
+    return [*scope.registration_levels] if needs_pose else [None]
+
+
+def _rows(scope: Scope) -> dict[tuple[str, str], Condition]:
+    """By aligner and level of the initial pose's noise, in order of budget."""
+    rows = {}
+    for aligner in scope.registrations:
+        for level in _levels(scope, aligner):
+            for budget in scope.budgets:
+                label = (
+                    aligner_title(aligner) if level is None else f"{aligner_title(aligner)}, initial pose ±{level:g}"
+                )
+                rows[label, f"{budget}"] = as_is(
+                    scope.localised[0],
+                    level or 0.0,
+                    aligner,
+                    aligner_options={"budget_bytes": budget},
+                    every=scope.registration_every,
+                )
+    return rows
+
+
+def _conditions(scope: Scope) -> list[Condition]:
+    return [as_is("none"), as_is(scope.localised[0]), as_is(scope.localised[0], 0.0, "given"), *_rows(scope).values()]
+
+
+def _all_rows(scope: Scope) -> dict[tuple[str, str], Condition]:
+    bevglue = {("BEVGlue", ""): as_is(scope.localised[0])}
+    alone = {(method_title("none"), ""): as_is("none")}
+    return {**bevglue, **_rows(scope), **alone, ("True pose", ""): as_is(scope.localised[0], 0.0, "given")}
+
+
+def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
+    every = scope.registration_every
+    rows: list[list[Cell]] = []
+    for (label, budget), condition in _all_rows(scope).items():
+        sent = label not in (method_title("none"), "True pose")
+        quality = pose_quality([heard for _, heard in results.heard(condition, every)])
+        milliseconds = results.milliseconds(condition).get("alignment") if sent else None
+        rows.append(
+            [
+                label,
+                int(budget) if budget else None,
+                results.alignment_bytes(condition, every) if sent else None,
+                results.ap(condition, 0.5, every),
+                results.ap(condition, 0.7, every),
+                quality.success_1 if sent else None,
+                quality.success_3 if sent else None,
+                milliseconds,
+            ]
+        )
+    columns = (
+        "poses from",
+        "budget [bytes]",
+        "sent [bytes]",
+        "AP@0.5",
+        "AP@0.7",
+        "within 1 m, 1°",
+        "within 3 m, 3°",
+        "time [ms]",
+    )
+    notes = (
+        f"CoBEVGlue's fusion on every {every}th frame; bytes are of one collaborator in one frame, for alignment only.",
+        "Initial pose: ICP starts from claimed poses with this noise, in metres and degrees on every agent; the others "
+        "need none.",
+    )
+    return [Table("registration", "Registration of points against BEVGlue", columns, rows, notes)]
+
+
+def registration_points(scope: Scope, results: Results, iou: float) -> list[tuple[str, float, float]]:
+    """Label, bytes and average precision of every row: for a figure. Ego only sends nothing."""
+    every = scope.registration_every
+    points = []
+    for (label, _), condition in _all_rows(scope).items():
+        if label == "True pose":
+            continue
+        size = 0.0 if label == method_title("none") else results.alignment_bytes(condition, every)
+        points.append((label, size, results.ap(condition, iou, every)))
+    return points
+
+
+REGISTRATION = Experiment(
+    "registration",
+    "Registration of points (the paper's Figure 4)",
+    "Instead of boxes, collaborators send points, sampled to fit a budget, and the ego registers them.",
+    _conditions,
+    _tables,
+)

@@ -1,0 +1,135 @@
+"""What a table is made of: how wide it is, how conditions of several tables are spelled, and what rows are called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cobevglue.alignment import ALIGNERS
+from cobevglue.alignment.group import GroupAligner
+from cobevglue.experiments.condition import Condition
+from cobevglue.experiments.measure import Results
+from cobevglue.experiments.table import Table
+from cobevglue.fusion import FUSION_METHODS
+
+__all__ = ["FULL", "QUICK", "Experiment", "Scope", "aligner_title", "as_is", "attacked", "level_name", "method_title"]
+
+_METHOD_TITLES = {
+    "none": "No collaboration",
+    "late": "Late fusion",
+    "early": "Early fusion",
+    "f-cooper": "F-Cooper",
+    "v2vnet": "V2VNet",
+    "disconet": "DiscoNet",
+    "where2comm": "Where2comm",
+    "fpv-rcnn": "FPV-RCNN",
+    "v2vnet-robust": "V2VNet-robust",
+    "v2x-vit": "V2X-ViT",
+    "coalign": "CoAlign",
+    "cobevglue": "CoBEVGlue",
+}
+_ALIGNER_TITLES = {
+    "given": "given pose",
+    "bevglue": "BEVGlue",
+    "coalign": "CoAlign's pose graph",
+    "fpv-rcnn": "FPV-RCNN's correction",
+    "v2vnet-robust": "V2VNet-robust's correction",
+    "icp-2d": "ICP 2-D",
+    "icp-3d": "ICP 3-D",
+    "fpfh-teaser": "FPFH + TEASER",
+}
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How many conditions there are.
+
+    Attributes:
+        levels: of localisation noise, standard deviations in metres and in degrees; from none to strong.
+        registration_levels: the same, for the initial poses of registration.
+        budgets: what a collaborator may send for registration in a frame [bytes].
+        registration_every: registration is run on every so many frames.
+        trusting_every: how often the methods that trust poses are run under further disturbances, as this is their own
+            table's only and they do not remember.
+    """
+
+    levels: Sequence[float] = (0.0, 0.5, 1.5, 2.5)
+    registration_levels: Sequence[float] = (0.5, 1.5, 2.5)
+    budgets: Sequence[int] = (8_000, 64_000, 512_000)
+    registration_every: int = 4
+    trusting_every: int = 2
+
+    @property
+    def methods(self) -> list[str]:
+        """All fusion methods, in the order of the paper's Table 1."""
+        return list(FUSION_METHODS)
+
+    @property
+    def trusting(self) -> list[str]:
+        """The methods that collaborate and whose poses come from localisation, corrected or not."""
+        return [name for name in self.methods if name != "none" and FUSION_METHODS[name].usual_aligner != "bevglue"]
+
+    @property
+    def localised(self) -> list[str]:
+        """The methods that need no pose: CoBEVGlue."""
+        return [name for name in self.methods if FUSION_METHODS[name].usual_aligner == "bevglue"]
+
+    @property
+    def registrations(self) -> list[str]:
+        """The aligners that look at points."""
+        kinds = {name: kind for name, kind in ALIGNERS.items() if issubclass(kind, GroupAligner)}
+        return [name for name, kind in kinds.items() if "points" in kind.needs]
+
+
+FULL = Scope()
+QUICK = Scope(levels=(0.0, 2.5), registration_levels=(0.5,), budgets=(64_000,), registration_every=6, trusting_every=3)
+"""Minutes, to see that everything works."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Some tables that belong together.
+
+    Attributes:
+        name: short, as users type it.
+        title: heading.
+        text: what was done, one paragraph.
+        conditions: what is to be run for it.
+        tables: made of the results; the name of the data set says whether there are numbers of the paper.
+    """
+
+    name: str
+    title: str
+    text: str
+    conditions: Callable[[Scope], list[Condition]]
+    tables: Callable[[Scope, Results, str], list[Table]]
+
+
+def as_is(fusion: str, level: float = 0.0, aligner: str | None = None, **more: Any) -> Condition:
+    """A method with the aligner of its paper, or another one, at a level of noise [m, degrees]."""
+    used = aligner or FUSION_METHODS[fusion].usual_aligner
+    if level == 0.0:
+        return Condition(fusion=fusion, aligner=used, **more)
+    noise = {"position": level, "yaw": level}
+    return Condition(fusion=fusion, aligner=used, disturbance="noise", disturbance_options=noise, **more)
+
+
+def attacked(fusion: str, aligner: str | None = None) -> Condition:
+    """A method with the aligner of its paper, or another one, under the attack of the paper."""
+    return as_is(fusion, 0.0, aligner, disturbance="same-place")
+
+
+def level_name(level: float) -> str:
+    """A level of noise as the paper writes it."""
+    return f"{level:.1f}/{level:.1f}"
+
+
+def method_title(name: str) -> str:
+    """A fusion method as papers write it."""
+    return _METHOD_TITLES.get(name, name)
+
+
+def aligner_title(name: str) -> str:
+    """A source of poses for people."""
+    return _ALIGNER_TITLES.get(name, name)
