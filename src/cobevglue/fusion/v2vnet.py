@@ -1,0 +1,100 @@
+"""V2VNet (Wang et al., ECCV 2020): agents pass messages to each other, and each updates its map by what it heard."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from cobevglue.fusion.intermediate import SingleMapFusion
+from cobevglue.perception import HeadOutput, PointPillars
+from cobevglue.perception.backbone import conv_norm
+
+__all__ = ["V2VNet"]
+
+
+class V2VNet(SingleMapFusion):
+    """Cross-vehicle aggregation by a graph neural network (section 3.2 of the paper).
+
+    Every agent is a node, its map is the node's state. In each round every node gets a message from every node, itself
+    included: a convolution of both states, 0 where the sender's map does not reach. The maximum over the messages goes
+    into a gated recurrent unit whose hidden state is the node's map. After the last round, a linear layer in each
+    cell.
+
+    One map is shared, at half the resolution of the head's and with twice its channels.
+
+    It differs from the paper in that all states are in the ego's frame from the start, as only the ego's is decoded in
+    the end; the paper warps them to the receiver's frame in every round. What a convolution does to the border of a map
+    apart, that is the same. And as convolution is linear, that of two states is the sum of one of each, which takes n
+    convolutions of n agents in place of n x n. Ours are the sizes: messages have half as many channels as states, and
+    the receiver's half of the convolution and the recurrent unit see one cell only. Delays are not compensated.
+
+    Attributes:
+        rounds: how often messages are passed.
+    """
+
+    rounds: ClassVar[int] = 2
+
+    def __init__(self, detector: PointPillars) -> None:
+        super().__init__(detector)
+        narrow = self.config.shrink_channels
+        wide = 2 * narrow
+        self.down = conv_norm(narrow, wide, 3, stride=2)
+        self.sender = nn.Conv2d(wide, narrow, 3, padding=1)
+        self.receiver = nn.Conv2d(wide, narrow, 1, bias=False)
+        self.update = GatedUpdate(wide, narrow)
+        self.last = nn.Sequential(nn.Conv2d(wide, wide, 1), nn.ReLU(inplace=True))
+        self.up = nn.Sequential(
+            nn.ConvTranspose2d(wide, narrow, 2, stride=2, bias=False),
+            nn.BatchNorm2d(narrow, eps=1e-3, momentum=0.01),
+            nn.ReLU(inplace=True),
+        )
+
+    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """The neck's map, at half its resolution: stride 4."""
+        return [self.down(self.neck(features))]
+
+    def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
+        """The ego's state after all rounds of messages."""
+        return [self.pass_messages(maps[0], covered[0])]
+
+    def pass_messages(self, states: Tensor, weight: Tensor) -> Tensor:
+        """The ego's state after all rounds.
+
+        Args:
+            states: (n, C, H, W) of n agents at first, all in the ego's frame, the ego first.
+            weight: (n, 1, H, W) what messages from each agent are multiplied with.
+
+        Returns:
+            (C, H, W).
+        """
+        for remaining in reversed(range(self.rounds)):
+            receivers = states if remaining else states[:1]  # the ego's is the last state that is of use
+            sent, own = self.sender(states), self.receiver(receivers)
+            heard = torch.stack([(torch.relu(sent + one) * weight).amax(dim=0) for one in own])
+            states = self.update(receivers, heard)
+        last: Tensor = self.last(states)[0]
+        return last
+
+    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """The head, after a transposed convolution back to its resolution."""
+        output: HeadOutput = self.head(self.up(maps[0]))
+        return output
+
+
+class GatedUpdate(nn.Module):
+    """A gated recurrent unit in each cell (Ballas et al., ICLR 2016, with kernels of 1 x 1)."""
+
+    def __init__(self, states: int, inputs: int) -> None:
+        super().__init__()
+        self.gates = nn.Conv2d(states + inputs, 2 * states, 1)
+        self.candidate = nn.Conv2d(states + inputs, states, 1)
+
+    def forward(self, state: Tensor, heard: Tensor) -> Tensor:
+        """The new state (B, states, H, W): between the old one and a candidate made of it and what was heard."""
+        gates: Tensor = self.gates(torch.cat([state, heard], dim=1)).sigmoid()
+        change, keep = gates.chunk(2, dim=1)
+        candidate: Tensor = self.candidate(torch.cat([keep * state, heard], dim=1)).tanh()
+        return torch.lerp(state, candidate, change)

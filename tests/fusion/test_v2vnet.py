@@ -1,0 +1,101 @@
+"""V2VNet's rounds of messages, against the same written pair by pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cobevglue.fusion import FUSION_METHODS
+from cobevglue.fusion.v2vnet import GatedUpdate, V2VNet
+
+from . import checks
+
+DETECTOR = checks.small_detector()
+
+
+def make_method(seed: int = 1) -> V2VNet:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return V2VNet(DETECTOR).eval()
+
+
+def pair_by_pair(method: V2VNet, states: list[Tensor], weight: Tensor) -> Tensor:
+    """The paper's algorithm as it is written: all pairs, all agents, one convolution of both maps for each message."""
+    centre = F.pad(method.receiver.weight, (1, 1, 1, 1))
+    kernel = torch.cat([method.sender.weight, centre], dim=1)
+    for _ in range(method.rounds):
+        new = []
+        for receiver in states:
+            messages = []
+            for sender, mask in zip(states, weight, strict=True):
+                both = torch.cat([sender, receiver])[None]
+                messages.append(torch.relu(F.conv2d(both, kernel, method.sender.bias, padding=1)) * mask)
+            heard = torch.stack(messages).amax(dim=0)
+            new.append(method.update(receiver[None], heard)[0])
+        states = new
+    result: Tensor = method.last(states[0][None])[0]
+    return result
+
+
+@pytest.mark.parametrize("agents", [1, 2, 4])
+def test_messages_are_those_of_all_pairs(agents: int) -> None:
+    method = make_method()
+    states = torch.rand(agents, 16, 8, 16)
+    weight = torch.rand(agents, 1, 8, 16).round()
+    weight[0] = 1.0
+    expected = pair_by_pair(method, list(states), weight)
+    torch.testing.assert_close(method.pass_messages(states, weight), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_update_lies_between_the_state_and_the_candidate() -> None:
+    torch.manual_seed(0)
+    update = GatedUpdate(4, 2)
+    state, heard = 3.0 * torch.randn(2, 4, 5, 6), torch.randn(2, 2, 5, 6)
+    new = update(state, heard)
+    assert (new <= state.clamp(min=1.0)).all()  # a candidate is in [-1, 1]
+    assert (new >= state.clamp(max=-1.0)).all()
+    assert not torch.allclose(new, state)
+    with torch.no_grad():
+        assert update.gates.bias is not None
+        update.gates.bias.fill_(-1e4)
+    assert torch.equal(update(state, heard), state)
+
+
+def test_the_shared_map_has_half_the_numbers_of_the_heads() -> None:
+    rows, columns, _ = checks.SMALL.head_shape
+    message = make_method().message(checks.view(DETECTOR, 0))
+    shapes = {name: array.shape for name, array in message.items()}
+    assert shapes == {"map0": (2 * checks.SMALL.shrink_channels, rows // 2, columns // 2)}
+
+
+def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
+    method = make_method()
+    ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
+    heard = [checks.sent(method, near, checks.POSES[0])]
+    checks.assert_same_boxes(
+        method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
+    )
+
+
+def test_the_order_of_collaborators_does_not_matter() -> None:
+    checks.check_order_of_collaborators(make_method(), DETECTOR)
+
+
+def test_collaborators_matter() -> None:
+    checks.check_collaborators_matter(make_method(), DETECTOR)
+
+
+def test_gradients_reach_every_weight() -> None:
+    checks.check_all_parameters_learn(make_method(), DETECTOR)
+
+
+def test_saved_weights_say_the_same(tmp_path: Path) -> None:
+    checks.check_weights_survive_saving(make_method(1), make_method(2), DETECTOR, tmp_path)
+
+
+def test_it_goes_by_the_name_that_users_type() -> None:
+    assert FUSION_METHODS["v2vnet"] is V2VNet
