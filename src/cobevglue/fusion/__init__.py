@@ -5,13 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from cobevglue.datasets.frame import did_you_mean
+from cobevglue.fusion.coalign import CoAlign
 from cobevglue.fusion.cobevglue import MaxFusion
+from cobevglue.fusion.disconet import DiscoNet
 from cobevglue.fusion.early import EarlyFusion
 from cobevglue.fusion.f_cooper import FCooper
+from cobevglue.fusion.fpv_rcnn import FPVRCNN
 from cobevglue.fusion.intermediate import FusionSample, IntermediateFusion, MultiScaleFusion, SingleMapFusion
 from cobevglue.fusion.late import LateFusion
 from cobevglue.fusion.method import FusionMethod, Received
 from cobevglue.fusion.none import NoCollaboration
+from cobevglue.fusion.v2vnet import V2VNet
+from cobevglue.fusion.v2vnet_robust import V2VNetRobust
+from cobevglue.fusion.v2x_vit import V2XViT
+from cobevglue.fusion.where2comm import Where2comm
 from cobevglue.perception import PointPillars
 
 __all__ = [
@@ -31,6 +38,13 @@ FUSION_METHODS: dict[str, type[FusionMethod]] = {
     "late": LateFusion,
     "early": EarlyFusion,
     "f-cooper": FCooper,
+    "v2vnet": V2VNet,
+    "disconet": DiscoNet,
+    "where2comm": Where2comm,
+    "fpv-rcnn": FPVRCNN,
+    "v2vnet-robust": V2VNetRobust,
+    "v2x-vit": V2XViT,
+    "coalign": CoAlign,
     "cobevglue": MaxFusion,
 }
 """From the name users type to the class, in the order of the paper's Table 1."""

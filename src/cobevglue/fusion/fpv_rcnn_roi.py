@@ -1,0 +1,87 @@
+"""FPV-RCNN's second stage: a closer look at each proposal, through the keypoints of all agents that lie in it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["RoIHead"]
+
+_CHANNELS = 32
+_HIDDEN = 128
+_SCORE_LIMIT = 1e-4
+
+
+class RoIHead(nn.Module):
+    """RoI grid pooling and fully connected layers (as in PV-RCNN, Shi et al., CVPR 2020).
+
+    A proposal is cut into cells, in its own axes. What is said of a cell is the maximum over the keypoints in it of a
+    small network that knows their features and where they are. PV-RCNN pools around each grid point within two radii,
+    so that a keypoint is looked at many times; here it counts for its own cell, which is what a CPU has time for.
+
+    Scores are told relative to those of the proposals, so that before training they are the same.
+
+    Args:
+        features: F, of a keypoint.
+        margin: by how much a proposal is enlarged on every side [m].
+        grid: cells along length, width and height.
+    """
+
+    def __init__(self, features: int, margin: float, grid: tuple[int, int, int] = (6, 4, 2)) -> None:
+        super().__init__()
+        self.margin, self.grid = margin, grid
+        self.point = nn.Sequential(
+            nn.Linear(features + 6, _CHANNELS), nn.ReLU(inplace=True), nn.Linear(_CHANNELS, _CHANNELS), nn.ReLU()
+        )
+        self.box = nn.Sequential(
+            nn.Linear(math.prod(grid) * _CHANNELS + 5, _HIDDEN),
+            nn.ReLU(inplace=True),
+            nn.Linear(_HIDDEN, _HIDDEN),
+            nn.ReLU(inplace=True),
+        )
+        self.logit, self.refinement = nn.Linear(_HIDDEN, 1), nn.Linear(_HIDDEN, 7)
+        for layer in (self.logit, self.refinement):
+            nn.init.normal_(layer.weight, std=0.001)
+            nn.init.zeros_(layer.bias)
+
+    def forward(
+        self, boxes: Tensor, score: Tensor, count: Tensor, keypoints: Tensor, features: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What to make of R proposals.
+
+        Args:
+            boxes: (R, 7) x, y, z, l, w, h [m], yaw [rad].
+            score: (R,) of the proposals, 0 to 1.
+            count: (R,) how many proposals each is made of.
+            keypoints: (K, 3) x, y, z [m] in the same frame, of all agents.
+            features: (K, F) theirs.
+
+        Returns:
+            (R,) logits of being an object, and (R, 7) refinements as `decode_refinement` takes them.
+        """
+        prior = torch.logit(score, eps=_SCORE_LIMIT)
+        known = torch.cat([boxes[:, 3:6].log(), prior[:, None], count[:, None].log()], dim=1)
+        x = self.box(torch.cat([self.pool(boxes, keypoints, features).flatten(1), known], dim=1))
+        return prior + self.logit(x)[:, 0], self.refinement(x)
+
+    def pool(self, boxes: Tensor, keypoints: Tensor, features: Tensor) -> Tensor:
+        """(R, cells, channels) what the keypoints say of every cell of every proposal; 0 where there are none."""
+        offset = keypoints - boxes[:, None, :3]  # (R, K, 3)
+        c, s = boxes[:, None, 6].cos(), boxes[:, None, 6].sin()
+        x, y, z = offset.unbind(dim=-1)
+        local = torch.stack([c * x + s * y, c * y - s * x, z], dim=-1)
+        share = local / (boxes[:, None, 3:6] + 2.0 * self.margin) + 0.5  # 0 to 1 inside
+        inside = ((share >= 0.0) & (share < 1.0)).all(dim=-1)
+        box, keypoint = inside.nonzero(as_tuple=True)
+        share, local = share[inside], local[inside]
+
+        grid = torch.tensor(self.grid, device=boxes.device)
+        i, j, k = (share * grid).long().unbind(dim=-1)
+        cells = math.prod(self.grid)
+        cell = box * cells + (i * self.grid[1] + j) * self.grid[2] + k
+        said: Tensor = self.point(torch.cat([features[keypoint], local, share - 0.5], dim=1))
+        pooled = said.new_zeros(len(boxes) * cells, said.shape[1])
+        pooled = pooled.scatter_reduce(0, cell[:, None].expand_as(said), said, "amax")
+        return pooled.view(len(boxes), cells, _CHANNELS)

@@ -1,0 +1,106 @@
+"""V2X-ViT (Xu et al., "V2X-ViT: Vehicle-to-Everything Cooperative Perception with Vision Transformer", ECCV 2022).
+
+Sized for a CPU: two blocks of the paper's three, fewer channels, windows of 4 and 8 cells without those of 16, which
+take as long as all the rest. Left out, as there is nothing for them to tell:
+
+- Agent types. This system does not say which agents are roadside units. With one type, the heterogeneous attention's
+  matrices for each pair of types are products with those of key and value, so that nothing but these remains.
+- Delay-aware positional encoding, and the correction of where a delayed agent has moved to: all clouds of a frame are
+  of one time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from cobevglue.fusion.intermediate import IntermediateFusion
+from cobevglue.fusion.v2x_vit_attention import AgentAttention, MultiScaleWindowAttention
+from cobevglue.perception import PointPillars
+from cobevglue.perception.head import HeadOutput
+
+__all__ = ["V2XViT", "V2XViTBlock"]
+
+_BLOCKS = 2
+_WINDOWS = (4, 8)
+"""Sides of the windows [cells]; a cell is 1.6 m with the compact detector, as in the paper."""
+
+
+class V2XViT(IntermediateFusion):
+    """A transformer over agents and places, on a map at stride 4 with twice the channels of the neck's.
+
+    Both changes of scale, to stride 4 before sending and back before the head, are by windows of 2 x 2 cells: a cell's
+    centre stays where warping takes it to be.
+    """
+
+    training_noise = (0.2, 0.2)
+
+    def __init__(self, detector: PointPillars) -> None:
+        super().__init__(detector)
+        shrunk = self.config.shrink_channels
+        channels = 2 * shrunk
+        self.down = nn.Sequential(
+            nn.Conv2d(shrunk, channels, 2, 2, bias=False),
+            nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01),
+            nn.ReLU(inplace=True),
+        )
+        self.blocks = nn.ModuleList(V2XViTBlock(channels, _WINDOWS) for _ in range(_BLOCKS))
+        self.up = nn.Sequential(
+            nn.ConvTranspose2d(channels, shrunk, 2, 2, bias=False),
+            nn.BatchNorm2d(shrunk, eps=1e-3, momentum=0.01),
+            nn.ReLU(inplace=True),
+        )
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """The neck's map at stride 4."""
+        return [self.down(self.neck(features))]
+
+    def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
+        """The ego's map after all blocks."""
+        x = maps[0].permute(0, 2, 3, 1)
+        present = covered[0][:, 0] > 0
+        for number, block in enumerate(self.blocks, start=1):
+            x = block(x, present, len(x) if number < _BLOCKS else 1)
+        return [x[0].permute(2, 0, 1)]
+
+    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
+        """Back to stride 2, and the head."""
+        output: HeadOutput = self.head(self.up(maps[0]))
+        return output
+
+
+class V2XViTBlock(nn.Module):
+    """Attention over agents, attention over places, and a feed-forward network, each after a norm and added.
+
+    What the paper alternates in its encoder.
+
+    Args:
+        channels: C.
+        windows: sides of the windows [cells].
+    """
+
+    def __init__(self, channels: int, windows: Sequence[int]) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
+        self.agents = AgentAttention(channels)
+        self.places = MultiScaleWindowAttention(channels, windows)
+        self.feed_forward = nn.Sequential(nn.Linear(channels, channels), nn.GELU(), nn.Linear(channels, channels))
+
+    def forward(self, x: Tensor, present: Tensor, wanted: int) -> Tensor:
+        """What the first agents make of all.
+
+        Args:
+            x: (n, H, W, C) of n agents.
+            present: (n, H, W) whether the agent sees anything there; of some agent in every cell.
+            wanted: how many agents' results are asked for.
+
+        Returns:
+            (wanted, H, W, C).
+        """
+        x = x[:wanted] + self.agents(self.norms[0](x), present, wanted)
+        x = x + self.places(self.norms[1](x))
+        added: Tensor = x + self.feed_forward(self.norms[2](x))
+        return added
