@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -100,7 +101,7 @@ def test_in_training_a_random_share_of_the_most_confident_cells_is_selected() ->
     assert counts.max() > 10 * counts.min()
     assert len(counts.unique()) > 20
     order = counts.argsort()
-    for fewer, more in zip(order[:-1], order[1:], strict=True):  # all of one map: the more there are, the more are in
+    for fewer, more in itertools.pairwise(order):  # all of one map: the more there are, the more are in
         assert (selected[fewer] <= selected[more]).all()
     one = selected[order[0], 0] > 0
     assert confidence[0, 0][one].mean() > confidence[0, 0].mean()
@@ -146,7 +147,7 @@ def test_attention_is_what_the_formula_says() -> None:
     for cell in range(2):
         x = told[:, :, 0, cell]
         query = matrix["query.weight"][:, :, 0, 0] @ x[0] + matrix["query.bias"]
-        key = x @ matrix["key.weight"][:, :, 0, 0].T + matrix["key.bias"]
+        key = x @ matrix["key.weight"][:, :, 0, 0].T
         raw = np.exp(key @ query / math.sqrt(5)) * confidence[:, 0, 0, cell] * present[:, 0, 0, cell]
         np.testing.assert_allclose(weight[:, cell], raw / raw.sum(), atol=1e-12)
         mixed = (raw / raw.sum()) @ features[:, :, 0, cell]

@@ -31,7 +31,8 @@ class AgentAttention(nn.Module):
         if channels % heads:
             raise ValueError(f"channels: {channels} is not a multiple of {heads} heads")
         self.heads = heads
-        self.query, self.key = nn.Linear(channels, channels), nn.Linear(channels, channels)
+        self.query = nn.Linear(channels, channels)
+        self.key = nn.Linear(channels, channels, bias=False)  # one would add the same to all scores
         self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
 
     def forward(self, x: Tensor, present: Tensor, wanted: int) -> Tensor:

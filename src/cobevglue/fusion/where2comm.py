@@ -139,7 +139,8 @@ class ConfidenceAttention(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         told = channels + 2 * len(_WAVELENGTHS)
-        self.query, self.key = nn.Conv2d(told, channels, 1), nn.Conv2d(told, channels, 1)
+        self.query = nn.Conv2d(told, channels, 1)
+        self.key = nn.Conv2d(told, channels, 1, bias=False)  # one would add the same to all scores
         last = nn.Conv2d(2 * channels, channels, 1)
         nn.init.normal_(last.weight, std=0.001)
         if last.bias is not None:
