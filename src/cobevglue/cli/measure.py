@@ -21,7 +21,7 @@ from cobevglue.messages import ObjectMessage, decode, encode
 from cobevglue.se2 import SE2
 from cobevglue.tracking import Sort
 
-__all__ = ["OBJECT_COUNTS", "STEPS", "measure"]
+__all__ = ["OBJECT_COUNTS", "STEPS", "measure", "processor_name"]
 
 OBJECT_COUNTS = (5, 15, 40, 100, 200)
 TRACK, ENCODE, DECODE = "track", "encode", "decode"
@@ -61,7 +61,7 @@ def measure(progress: Callable[[int], None]) -> dict[str, Any]:
     return {
         "steps": steps,
         "message_bytes": message_bytes,
-        "machine": {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system()},
+        "machine": {"processor": processor_name(), "cores": os.cpu_count(), "system": platform.system()},
         "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
     }
 
@@ -147,7 +147,7 @@ def _detected(boxes: Boxes, rng: np.random.Generator) -> Boxes:
     return noisy[rng.permutation(n)]
 
 
-def _processor() -> str:
+def processor_name() -> str:
     """The processor's name, where the system tells it."""
     info = Path("/proc/cpuinfo")
     if info.is_file():

@@ -35,6 +35,10 @@ class Results:
     min_points: int
     _precision: dict[tuple[str, int], dict[float, float]] = field(default_factory=dict)
 
+    def has(self, condition: Condition) -> bool:
+        """Whether the condition was run."""
+        return all(condition.key in drive.conditions for drive in self.drives)
+
     def ap(self, condition: Condition, iou: float, every: int = 1) -> float:
         """Average precision, in [0, 1]; NaN where no object counts.
 

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from cobevglue.datasets import DATASETS
 from cobevglue.datasets.frame import Frame, Scenario, did_you_mean
@@ -43,7 +43,7 @@ class StudySettings(Settings):
         min_points: objects on which all agents together have fewer points are ignored.
 
     Raises:
-        ValueError: no such data set (names the nearest), or a value out of its range.
+        ValueError: a value out of its range.
     """
 
     dataset: str = SIMULATED
@@ -57,13 +57,6 @@ class StudySettings(Settings):
     untrained: bool = False
     min_points: Annotated[int, Field(ge=0)] = 5
 
-    @field_validator("dataset")
-    @classmethod
-    def _known(cls, dataset: str) -> str:
-        if dataset != SIMULATED and dataset not in DATASETS:
-            raise ValueError(f"no data set {did_you_mean(dataset, [SIMULATED, *DATASETS])}")
-        return dataset
-
     @property
     def label(self) -> str:
         """What tables call the data."""
@@ -74,7 +67,7 @@ def drive_names(settings: StudySettings) -> list[str]:
     """The drives that a study goes through.
 
     Raises:
-        ValueError: the data set has no root, or simulated ones have one; or no such split.
+        ValueError: no such data set or split (names the nearest); it has no root, or simulated drives have one.
         FileNotFoundError: there is no such data set at the root.
         ModuleNotFoundError: the simulation is not installed.
     """
@@ -82,6 +75,8 @@ def drive_names(settings: StudySettings) -> list[str]:
         if settings.root is not None:
             raise ValueError("simulated drives have no root: they are made on the way")
         return [_simulated(settings, number).name for number in range(settings.scenarios or _SIMULATED_DRIVES)]
+    if settings.dataset not in DATASETS:
+        raise ValueError(f"no data set {did_you_mean(settings.dataset, [SIMULATED, *DATASETS])}")
     if settings.root is None:
         raise ValueError(f"the data set {settings.dataset} needs a root, the folder where it is")
     names = DATASETS[settings.dataset](Path(settings.root), settings.split).scenarios

@@ -1,0 +1,208 @@
+"""`cobevglue reproduce`: the paper's tables and figures on any data set."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cobevglue.cli.errors import InputError, expected_errors
+from cobevglue.cli.output import print_json, print_note, print_table
+
+if TYPE_CHECKING:
+    from cobevglue.experiments.study import StudySettings
+
+__all__ = ["reproduce"]
+
+_PACKAGES = ("cobevglue", "torch", "numpy", "scipy", "numba", "libsumo", "open3d-cpu", "small-gicp", "ray")
+_QUICK_DRIVES, _QUICK_FRAMES = 2, 6
+_REAL_SPLIT = "test_culvercity"
+
+
+def reproduce(
+    context: typer.Context,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Minutes instead of an hour: few drives, frames and conditions.")
+    ] = False,
+    dataset: Annotated[str, typer.Option(help="simulated, opv2v, v2xset, v2v4real or dair-v2x.")] = "simulated",
+    root: Annotated[Path | None, typer.Option(help="Root of the data set; none for simulated.")] = None,
+    split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
+    real: Annotated[
+        Path | None, typer.Option(help="Root of OPV2V, whose split test_culvercity is reported beside the other data.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the report; an interrupted run goes on in it.")] = Path("report"),
+    tables: Annotated[
+        str | None,
+        typer.Option(
+            help="Only these, with commas: noise, attack, registration, ablation, disturbances, pose, communication, "
+            "time."
+        ),
+    ] = None,
+    scenarios: Annotated[
+        int | None, typer.Option(min=1, help="So many drives at most; 20 of simulated ones if left out.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="So many frames of each drive; 20 of simulated ones if left out.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of simulated drives and all that goes wrong.")] = None,
+    detector: Annotated[str, typer.Option(help="A shipped model's name, or a .safetensors file.")] = "compact",
+    weights: Annotated[
+        Path | None, typer.Option(help="Folder with weights of the fusion methods, NAME.safetensors.")
+    ] = None,
+    untrained: Annotated[
+        bool, typer.Option("--untrained", help="Fusion methods without weights of their own, to try things out.")
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
+    ] = None,
+    use_ray: Annotated[
+        bool, typer.Option("--ray", help="On the Ray cluster at RAY_ADDRESS, or a local one of --workers processes.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Reproduce the paper's tables and figures, on simulated drives or on a data set of yours.
+
+    Every fusion method under localisation noise and attack, registration of points, ablation, other disturbances,
+    quality of poses, communication and time. Writes index.html, report.md and CSV files; with a data set of the paper,
+    its own numbers stand beside.
+
+    What was run is kept in the folder: the same command goes on where it was interrupted, and with other --tables runs
+    only what is missing.
+    """
+    start = time.perf_counter()
+    try:
+        from cobevglue.experiments.reproduce import reproduce as run
+        from cobevglue.experiments.study import SEED, StudySettings
+        from cobevglue.experiments.tables import EXPERIMENTS, FULL, QUICK, experiments_named
+    except ImportError as error:
+        raise InputError(" ".join(str(error).split())) from error
+    names = list(EXPERIMENTS) if tables is None else [name.strip() for name in tables.split(",")]
+    common: dict[str, Any] = {
+        "scenarios": scenarios or (_QUICK_DRIVES if quick else None),
+        "frames": frames or (_QUICK_FRAMES if quick else None),
+        "seed": SEED if seed is None else seed,
+        "detector": detector,
+        "weights": None if weights is None else str(weights),
+        "untrained": untrained,
+    }
+    studies = [StudySettings(dataset=dataset, root=None if root is None else str(root), split=split, **common)]
+    if real is not None:
+        # Not all of its drives have clouds: those without are no reason to look at fewer.
+        studies.append(
+            StudySettings(dataset="opv2v", root=str(real), split=_REAL_SPLIT, **{**common, "scenarios": None})
+        )
+    try:
+        with expected_errors(), _progress_bar() as progress:
+            made = run(
+                studies,
+                experiments_named(names),
+                QUICK if quick else FULL,
+                out,
+                _about(context, studies),
+                workers=workers or os.cpu_count() or 1,
+                use_ray=use_ray,
+                progress=progress,
+            )
+    except ModuleNotFoundError as error:
+        raise InputError(" ".join(str(error).split())) from error
+    minutes = (time.perf_counter() - start) / 60.0
+    if as_json:
+        print_json(
+            {
+                "page": str(out / "index.html"),
+                "minutes": minutes,
+                "studies": [study.model_dump(mode="json") for study in studies],
+                "tables": {
+                    label or "summary": [
+                        {"name": table.name, "title": table.title, "columns": list(table.columns), "rows": table.rows}
+                        for table in each
+                    ]
+                    for label, each in made.items()
+                },
+            }
+        )
+        return
+    (summary,) = made[""]
+    print_table(summary.title, summary.columns, summary.text_rows())
+    print(f"Open {out / 'index.html'} to see all of it ({minutes:.1f} minutes).")
+
+
+def _about(context: typer.Context, studies: Sequence[StudySettings]) -> list[str]:
+    """Command, seed, versions, machine and date, a line each."""
+    from cobevglue.cli.measure import processor_name
+
+    installed = {distribution.name: distribution.version for distribution in distributions()}
+    versions = {
+        "python": platform.python_version(),
+        **{name: installed[name] for name in _PACKAGES if name in installed},
+    }
+    return [
+        f"Command: {_command(context)}",
+        f"Seed: {studies[0].seed}",
+        "Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items()),
+        f"Machine: {processor_name()}, {os.cpu_count()} cores, {platform.system()}",
+        f"Date: {time.strftime('%Y-%m-%d %H:%M %Z')}",
+    ]
+
+
+def _command(context: typer.Context) -> str:
+    """What the user typed, option by option."""
+    words = [context.command_path]
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if source is not None and source.name == "COMMANDLINE":
+            value = context.params[parameter.name or ""]
+            words += [parameter.opts[0]] if value is True else [parameter.opts[0], str(value)]
+    return shlex.join(words)
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[str, float, float], None]]:
+    """A bar on standard error for each data set, with the time that is left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left:"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    bar = Progress(*columns, console=console)
+    tasks: dict[str, Any] = {}
+    noted = time.perf_counter()
+
+    def show(label: str, done: float, total: float) -> None:
+        nonlocal noted
+        if label not in tasks:
+            bar.start()  # with the first frame: what is wrong from the beginning is said without a bar
+            tasks[label] = bar.add_task(label, total=total)
+        bar.update(tasks[label], completed=done, total=total)
+        if not console.is_terminal and time.perf_counter() - noted > 60.0:  # a log gets a line a minute
+            noted = time.perf_counter()
+            left = bar.tasks[tasks[label]].time_remaining
+            print_note(f"{label}: {done / total:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))
+
+    try:
+        yield show
+    finally:
+        if bar.live.is_started:
+            bar.stop()
