@@ -10,6 +10,10 @@ from cobevglue.alignment.bevglue import BEVGlue
 from cobevglue.alignment.config import AffinityConfig, BEVGlueConfig
 from cobevglue.alignment.given import GivenLocalisation
 from cobevglue.alignment.group import GroupAligner, Observation, Pairwise
+from cobevglue.alignment.max_consensus import MaximumConsensus
+from cobevglue.alignment.pose_graph import CoAlign
+from cobevglue.alignment.registration import ICP2D, ICP3D, FPFHTeaser
+from cobevglue.alignment.v2vnet_robust import V2VNetRobustPoses
 from cobevglue.datasets.frame import did_you_mean
 
 __all__ = [
@@ -27,6 +31,12 @@ __all__ = [
 ALIGNERS: dict[str, type[Aligner] | type[GroupAligner]] = {
     "bevglue": BEVGlue,
     "given": GivenLocalisation,
+    "coalign": CoAlign,
+    "fpv-rcnn": MaximumConsensus,
+    "icp-2d": ICP2D,
+    "icp-3d": ICP3D,
+    "fpfh-teaser": FPFHTeaser,
+    "v2vnet-robust": V2VNetRobustPoses,
 }
 """From the name users type to the class: an `Aligner` looks at the boxes of two agents, a `GroupAligner` at what it
 says it needs of all of them."""
