@@ -1,251 +1,360 @@
-"""The demonstration: two cars at a simulated junction find each other from the objects that both see.
+"""The demonstration: cars at a junction see together, the whole system on simulated LiDAR and the shipped weights.
 
-Each frame goes the way it would on the road: each car detects boxes and tracks them, the second car's tracked boxes
-are encoded to bytes, decoded by the first, and aligned by BEVGlue, which gets nothing else. Beside it, the same boxes
-are placed by other sources of the relative pose: GPS with noise, GPS under attack, and the truth.
+Every car looks at the scene once a frame. What they saw is then put together in five ways: not at all, by poses from
+noisy GPS, from GPS under attack, by CoBEVGlue, which gets no position from anywhere, and by the true poses.
 """
 
 from __future__ import annotations
 
 import math
 import platform
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from cobevglue.alignment import group_aligner
 from cobevglue.boxes import Boxes
-from cobevglue.messages import ObjectMessage, decode, encode
+from cobevglue.datasets.frame import AgentFrame, Frame
+from cobevglue.datasets.poses import inverse_SE3
+from cobevglue.disturbance import Disturbance, LocalisationNoise, Moment, SamePlace, Undisturbed
+from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
+from cobevglue.evaluation.detection_matching import DROPPED, FALSE, EvaluationRange, inside, match, prepare
+from cobevglue.fusion.cobevglue import MaxFusion
+from cobevglue.fusion.none import NoCollaboration
+from cobevglue.perception import PointPillars
 from cobevglue.se2 import SE2
-from cobevglue.simulation import Junction, ObjectListFrame
-from cobevglue.tracking import Sort
-from cobevglue.typing import FloatArray
+from cobevglue.simulation.road_network import RoadNetwork
+from cobevglue.simulation.scenario import ScenarioSettings, SimulatedScenario
+from cobevglue.simulation.world import LidarView
+from cobevglue.system import CoBEVGlue, StepOutput
+from cobevglue.typing import BoolArray, Float32Array, FloatArray, IntArray
 
-if TYPE_CHECKING:
-    from cobevglue.alignment import Alignment
+__all__ = [
+    "COBEVGLUE",
+    "EGO_ONLY",
+    "FRAMES",
+    "IOU",
+    "MIN_POINTS",
+    "NETWORK",
+    "NOISE",
+    "ROWS",
+    "SCORE",
+    "DemoFrame",
+    "DemoResult",
+    "Verdict",
+    "run_demo",
+]
 
-__all__ = ["BEVGLUE", "EGO", "OTHER", "POSE_SOURCES", "TRUE_POSE", "DemoFrame", "DemoResult", "run_demo"]
+EGO_ONLY, COBEVGLUE = "ego_only", "cobevglue"
+ROWS = MappingProxyType(
+    {
+        EGO_ONLY: "ego only",
+        "noisy_gps": "fused on noisy GPS",
+        "attacked_gps": "fused under attack",
+        COBEVGLUE: "CoBEVGlue, no GPS",
+        "true_pose": "fused on true poses",
+    }
+)
+"""What is compared, and how people read it."""
 
-EGO, OTHER = "car1", "car2"
-"""The car that receives, and the one that sends."""
+NOISE = LocalisationNoise(position=2.0, yaw=2.0)
+"""Of the noisy GPS: standard deviations [m, degrees], of every car and frame independently."""
 
-BEVGLUE, TRUE_POSE = "bevglue", "true_pose"
-POSE_SOURCES = {
-    "gps_0.5": "GPS, noise 0.5 m and 0.5°",
-    "gps_2.5": "GPS, noise 2.5 m and 2.5°",
-    "gps_attacked": "GPS under attack",
-    BEVGLUE: "BEVGlue, no GPS",
-    TRUE_POSE: "true pose",
-}
-"""What the other's boxes are placed with, and how people read it. Noise is a Gaussian on x, y and yaw of both cars; the
-attacked car claims to stand where the ego stands."""
+_GPS: dict[str, Disturbance] = {"noisy_gps": NOISE, "attacked_gps": SamePlace()}
+"""What is wrong with the poses that a row is given; under attack, everyone else claims the ego's place."""
 
-WRONG_BEYOND = (3.0, math.radians(3.0))
-"""An accepted pose that is further off than this [m, rad] counts as a wrong accept."""
-PLACED_WITHIN = 2.0
-"""A box nearer than this [m] to its object counts as placed: about the width of a car."""
+WEIGHTS, NETWORK, AGENTS = "compact", "junction_test_0", 3
+"""The detector and the road network, a junction that nothing was trained on; how many cars have a LiDAR."""
 
-_GPS_STREAM = 100  # of random numbers; the simulation has the first ones
-_GPS_LEVELS = {"gps_0.5": 0.5, "gps_2.5": 2.5}  # standard deviations, in metres and in degrees
+FRAMES, FRAMES_AT_MOST, RATE = 40, 200, 10.0
+MIN_POINTS = 5
+"""Vehicles that fewer points of all LiDARs together lie on do not count: nothing could find them. Those with fewer
+points of the ego's own are hidden from it."""
+SCORE, IOU = 0.3, 0.5
+"""What is drawn and counted as found: detections of at least this score that overlap a vehicle by at least this."""
+
+_NEAR = 50.0  # what is hidden within this distance concerns the ego [m]
+_MOVING = 1.0  # [m/s]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Verdict:
+    """What is right and wrong about the boxes of one row in one frame.
+
+    Attributes:
+        boxes: K detections sure enough to be looked at, in the ego's frame.
+        ghost: (K,) whether there is no vehicle where a box is; nor is there one that does not count.
+        found: (N,) which of the frame's vehicles were found; only those that count can be.
+    """
+
+    boxes: Boxes
+    ghost: BoolArray
+    found: BoolArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DemoFrame:
-    """What happened in one frame.
+    """What happened in one frame; poses and boxes are in the ego's LiDAR frame unless said otherwise.
 
     Attributes:
         index: 0, 1, 2, …
         time: time stamp [s].
-        ego: the ego's tracked boxes, in its own frame.
-        other: the other's tracked boxes as they were received, in the other's frame.
-        alignment: what BEVGlue made of the two.
-        poses: ego_SE2_other of each pose source; None where it was refused.
-        objects: (N, 2) where the objects of the other's boxes truly are, in the ego's frame [m]; NaN for false boxes.
-        new_objects: how many objects the other detected that the ego did not.
-        message_bytes: how long the message was.
-        align_seconds: how long the alignment took.
-        truth: all vehicles but the ego itself, in the ego's frame.
+        ego: the name of the agent whose frame it is.
+        reach: where the detector looks, and what counts.
+        world_SE2_ego: where the ego is.
+        points: the clouds of all agents by name, (N, 4) float32, each in its own LiDAR frame.
+        truth: N vehicles that at least one point of some agent lies on, without the ego.
+        point_count: (N,) points of all agents on each.
+        own_point_count: (N,) those of the ego's.
+        speed: (N,) [m/s].
+        ego_SE2_others: the true poses of the others.
+        tracked: the boxes that each agent detected and tracks, each in its own LiDAR frame.
+        outputs: what the system made of it, by row.
     """
 
     index: int
     time: float
-    ego: Boxes
-    other: Boxes
-    alignment: Alignment
-    poses: dict[str, SE2 | None]
-    objects: FloatArray
-    new_objects: int
-    message_bytes: int
-    align_seconds: float
+    ego: str
+    reach: EvaluationRange
+    world_SE2_ego: SE2
+    points: dict[str, Float32Array]
     truth: Boxes
+    point_count: IntArray
+    own_point_count: IntArray
+    speed: FloatArray
+    ego_SE2_others: dict[str, SE2]
+    tracked: dict[str, Boxes] = field(default_factory=dict)
+    outputs: dict[str, StepOutput] = field(default_factory=dict)
 
     @property
-    def pose_error(self) -> tuple[float, float] | None:
-        """How far BEVGlue's pose is off, translation [m] and yaw [rad]; None where it refused."""
-        pose, truth = self.poses[BEVGLUE], self.poses[TRUE_POSE]
-        return None if pose is None or truth is None else pose.error_to(truth)
+    def counted(self) -> BoolArray:
+        """(N,) which vehicles should be found."""
+        return inside(self.truth, self.reach) & (self.point_count >= MIN_POINTS)
 
-    def placement_error(self, source: str) -> FloatArray | None:
-        """(K,) how far the other's boxes, placed with this source's pose, are from their objects [m].
+    @property
+    def hidden(self) -> BoolArray:
+        """(N,) which of these the ego cannot find by itself."""
+        return self.counted & (self.own_point_count < MIN_POINTS)
 
-        False boxes have no object and do not count. None where the pose was refused.
-        """
-        pose, real = self.poses[source], np.isfinite(self.objects[:, 0])
-        if pose is None:
-            return None
-        error: FloatArray = np.linalg.norm(pose.apply(self.other.center[real, :2]) - self.objects[real], axis=1)
-        return error
+    @property
+    def hidden_movers(self) -> IntArray:
+        """Rows of hidden vehicles that drive near the ego, the nearest first."""
+        distance = np.hypot(self.truth.center[:, 0], self.truth.center[:, 1])
+        rows = np.flatnonzero(self.hidden & (self.speed > _MOVING) & (distance < _NEAR))
+        return rows[np.argsort(distance[rows], kind="stable")]
+
+    def detections(self, row: str) -> DetectionFrame:
+        """What is said and what is true, as average precision is made of it."""
+        return DetectionFrame(self.outputs[row].boxes, self.truth, self.point_count, f"frame {self.index}")
+
+    def verdict(self, row: str) -> Verdict:
+        """What is right and wrong about the boxes of a row."""
+        scene = prepare(self.detections(row), self.reach, MIN_POINTS)
+        objects = match(scene, IOU)
+        sure = scene.score >= SCORE
+        found = np.zeros(len(self.truth), dtype=np.bool_)
+        found[objects[sure & (objects >= 0)]] = True
+        shown = sure & (objects != DROPPED)
+        return Verdict(scene.detections[shown], objects[shown] == FALSE, found)
+
+    def used_poses(self, row: str) -> dict[str, SE2]:
+        """Where a row has the other agents; those whose alignment was refused are left out."""
+        found = self.outputs[row].alignments
+        return {name: a.ego_SE2_other for name, a in found.items() if a.ego_SE2_other is not None}
+
+    def pose_errors(self, row: str) -> list[tuple[float, float]]:
+        """How far the poses that were used are off [m, rad]."""
+        return [pose.error_to(self.ego_SE2_others[name]) for name, pose in self.used_poses(row).items()]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DemoResult:
-    """The whole sequence.
+    """The whole drive.
 
     Attributes:
         seed: of the scene.
+        roads: the network, in the world's frame.
         frames: what happened, frame by frame.
     """
 
     seed: int
+    roads: RoadNetwork
     frames: tuple[DemoFrame, ...]
 
+    def story(self) -> DemoFrame:
+        """The frame to show: the first of those in which most vehicles drive near the ego and are hidden from it.
+
+        It is chosen by what is there, not by what was found.
+        """
+        return max(self.frames, key=lambda frame: len(frame.hidden_movers))
+
     def summary(self) -> dict[str, Any]:
-        """The numbers of the sequence, ready for JSON; rates are shares of all frames, units are in the names."""
-        errors = [error for frame in self.frames if (error := frame.pose_error) is not None]
-        n = len(self.frames)
-        milliseconds = 1e3 * np.array([frame.align_seconds for frame in self.frames])
+        """The numbers of the drive, ready for JSON; units are in the names, numbers of things are means per frame."""
         return {
             "seed": self.seed,
-            "frames": n,
-            "objects_per_frame": {
-                "ego": _mean([len(frame.ego) for frame in self.frames]),
-                "other": _mean([len(frame.other) for frame in self.frames]),
-                "matched": _mean([len(frame.alignment.matches) for frame in self.frames]),
-                "new_from_other": _mean([frame.new_objects for frame in self.frames]),
-            },
-            "alignment": {
-                **{f"success_{level}m_{level}deg": _success(errors, level) / n for level in (1, 2, 3)},
-                "refused": 1.0 - len(errors) / n,
-                "wrong_accepts": sum(m > WRONG_BEYOND[0] or rad > WRONG_BEYOND[1] for m, rad in errors) / n,
-                "median_error_m": _median([metres for metres, _ in errors]),
-                "median_error_deg": _median([math.degrees(radians) for _, radians in errors]),
-                "median_ms": _median(milliseconds),
-                "slowest_ms": float(milliseconds.max()),
-            },
-            "message_bytes_per_frame": _mean([frame.message_bytes for frame in self.frames]),
-            "placement": {source: self._placement(source) for source in POSE_SOURCES},
+            "ego": self.frames[0].ego,
+            "agents": max(len(frame.points) for frame in self.frames),
+            "frames": len(self.frames),
+            "vehicles": _mean([frame.counted.sum() for frame in self.frames]),
+            "hidden_from_ego": _mean([frame.hidden.sum() for frame in self.frames]),
+            "noise": {"xy_m": NOISE.position, "yaw_deg": NOISE.yaw},
+            "rows": {row: self._row(row) for row in ROWS},
+            "median_ms": self._times(),
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }
 
-    def _placement(self, source: str) -> dict[str, float | None]:
-        """How well the other's boxes are placed with the poses of this source."""
-        given = [errors for frame in self.frames if (errors := frame.placement_error(source)) is not None]
-        placed = np.concatenate(given) if given else np.zeros(0)
-        boxes = sum(int(np.isfinite(frame.objects[:, 0]).sum()) for frame in self.frames)
+    def _row(self, row: str) -> dict[str, Any]:
+        report = evaluate_detections(
+            (frame.detections(row) for frame in self.frames),
+            thresholds=(0.5, 0.7),
+            evaluation_range=self.frames[0].reach,
+            min_points=MIN_POINTS,
+        )
+        verdicts = [frame.verdict(row) for frame in self.frames]
+        errors = [error for frame in self.frames for error in frame.pose_errors(row)]
+        others = [
+            (output, name) for frame in self.frames for output in [frame.outputs[row]] for name in output.alignments
+        ]
         return {
-            "mean_error_m": _mean(placed),
-            "boxes_within_2m": float((placed < PLACED_WITHIN).sum() / boxes) if boxes else None,
-            "frames": len(given) / len(self.frames),
+            "name": ROWS[row],
+            "ap_0.5": report.ap(0.5),
+            "ap_0.7": report.ap(0.7),
+            "found": _mean([verdict.found.sum() for verdict in verdicts]),
+            "hidden_found": _mean(
+                [(v.found & frame.hidden).sum() for v, frame in zip(verdicts, self.frames, strict=True)]
+            ),
+            "ghosts": _mean([verdict.ghost.sum() for verdict in verdicts]),
+            "poses_used": len(errors) / len(others) if others else None,
+            "median_error_m": _median([metres for metres, _ in errors]),
+            "median_error_deg": _median([math.degrees(radians) for _, radians in errors]),
+            "bytes_for_pose": _mean([output.alignment_bytes[name] for output, name in others]),
+            "bytes_in_all": _mean([sum(output.message_bytes[name].values()) for output, name in others]),
         }
 
+    def _times(self) -> dict[str, float | None]:
+        """Median time of each stage of CoBEVGlue for one frame of all agents; the first, which compiles, left out."""
+        spent = [frame.outputs[COBEVGLUE].seconds for frame in self.frames[1:]]
+        return {stage: _median([1e3 * seconds[stage] for seconds in spent]) for stage in (spent[0] if spent else ())}
 
-def run_demo(seed: int = 0, *, frames: int = 80, progress: Callable[[int], None] | None = None) -> DemoResult:
-    """Simulate the junction and align every frame.
+
+def run_demo(seed: int = 0, *, frames: int = FRAMES, progress: Callable[[int], None] | None = None) -> DemoResult:
+    """Simulate the drive and put together, frame by frame, what the agents see.
+
+    The ego is the agent from which, in the middle of the drive, most vehicles are hidden that drive near it.
 
     Args:
         seed: of the scene and of the GPS noise, a whole number >= 0.
-        frames: how many of the scene's frames, at 10 Hz; at most 80.
+        frames: how many, at 10 Hz.
         progress: called after each frame with the number of frames done.
 
     Returns:
         What happened; the same for the same seed, but for the times that were measured.
 
     Raises:
-        ValueError: the seed is negative or the number of frames is out of range.
+        ValueError: the seed is negative, the number of frames out of range, or no agent stays all the time.
+        ImportError: torch, libsumo, embreex or trimesh is not installed.
     """
-    from cobevglue.alignment import BEVGlue
-
-    scene = Junction(seed)
-    if not 1 <= frames <= len(scene):
-        raise ValueError(f"frames must be from 1 to {len(scene)}, got {frames}")
-    _compile(scene[0])
-    trackers = {EGO: Sort(), OTHER: Sort()}
-    glue = BEVGlue()
+    if not 1 <= frames <= FRAMES_AT_MOST:
+        raise ValueError(f"frames must be from 1 to {FRAMES_AT_MOST}, got {frames}")
+    settings = ScenarioSettings(frames=frames, rate=RATE, agents=AGENTS, max_distance=_NEAR)
+    scenario = SimulatedScenario(NETWORK, seed, settings)
+    systems = _systems()
+    config = systems[COBEVGLUE].detector.config
+    reach = (*config.x_range, *config.y_range)
+    ego = _choose_ego(scenario, reach)
     done = []
-    for frame in (scene[index] for index in range(frames)):
-        tracked = {name: trackers[name].update(frame.agents[name].boxes, frame.time) for name in (EGO, OTHER)}
-        message = encode(ObjectMessage(OTHER, frame.time, frame.index, tracked[OTHER]))
-        received = decode(message).boxes
-        start = time.perf_counter()
-        alignment = glue.align(tracked[EGO], received, time=frame.time)
-        seconds = time.perf_counter() - start
-        done.append(_compare(frame, tracked[EGO], received, alignment, len(message), seconds, seed))
+    for index in range(frames):
+        done.append(_frame(scenario, index, ego, systems, reach))
         if progress is not None:
             progress(len(done))
-    return DemoResult(seed, tuple(done))
+    return DemoResult(seed, scenario.world.roads, tuple(done))
 
 
-def _compile(frame: ObjectListFrame) -> None:
-    """Have the kernels compiled, or loaded from their cache, before any time is taken."""
-    from cobevglue.alignment import BEVGlue
-
-    ego, other = (Sort().update(frame.agents[name].boxes) for name in (EGO, OTHER))
-    glue = BEVGlue()
-    for _ in range(2):  # the second frame uses what was remembered of the first
-        glue.align(ego, other)
+def _systems() -> dict[str, CoBEVGlue]:
+    """A system for each row, all with the same detector and, but for ego only, the same fusion."""
+    whole = _system()
+    given = {row: CoBEVGlue(whole.detector, whole.fusion, group_aligner("given")) for row in ROWS}
+    alone = CoBEVGlue(whole.detector, NoCollaboration(whole.detector), group_aligner("given"))
+    return {**given, EGO_ONLY: alone, COBEVGLUE: whole}
 
 
-def _compare(
-    frame: ObjectListFrame,
-    ego: Boxes,
-    received: Boxes,
-    alignment: Alignment,
-    message_bytes: int,
-    seconds: float,
-    seed: int,
+def _system() -> CoBEVGlue:
+    detector = PointPillars.pretrained(WEIGHTS)
+    return CoBEVGlue(detector, MaxFusion(detector).eval(), group_aligner("bevglue"))
+
+
+def _choose_ego(scenario: SimulatedScenario, reach: EvaluationRange) -> str:
+    staying = [
+        name
+        for name, carrier in scenario.carriers.items()
+        if all(carrier in snapshot.id for snapshot in scenario.traffic)
+    ]
+    if not staying:
+        raise ValueError(f"seed: in the drive of seed {scenario.seed} no agent stays all the time; take another")
+    middle = len(scenario) // 2
+    views = scenario.views(middle)
+    return max(staying, key=lambda name: len(_scene(scenario, middle, name, views, reach).hidden_movers))
+
+
+def _frame(
+    scenario: SimulatedScenario, index: int, ego: str, systems: Mapping[str, CoBEVGlue], reach: EvaluationRange
 ) -> DemoFrame:
-    """Hold BEVGlue's pose, and the others, against the truth."""
-    mine, theirs = frame.agents[EGO], frame.agents[OTHER]
-    poses: dict[str, SE2 | None] = {
-        **{source: _noisy_gps(frame, level, seed) for source, level in _GPS_LEVELS.items()},
-        "gps_attacked": SE2(),
-        BEVGLUE: alignment.ego_SE2_other,
-        TRUE_POSE: frame.ego_SE2_other(EGO, OTHER),
-    }
-    real = theirs.object_id >= 0
-    truth = frame.objects.transform(mine.world_SE2_agent.inverse())
-    objects = np.full((len(received), 2), np.nan)
-    objects[real] = truth.center[theirs.object_id[real], :2]  # object ids are rows of the scene's objects
+    """Simulate one frame, perceive, and put together what was perceived in every row's way."""
+    views = scenario.views(index)
+    scene = _scene(scenario, index, ego, views, reach)
+    seen = {name: systems[COBEVGLUE].perceive(name, points, scene.time) for name, points in scene.points.items()}
+    seconds = {"perception": sum(sum(view.seconds.values()) for view in seen.values())}
+    poses = {name: view.world_SE3_lidar for name, view in views.items()}
+    moment = Moment(scene.time, seen, poses, poses)
+    outputs = {}
+    for row, system in systems.items():
+        taking_part = {ego: seen[ego]} if row == EGO_ONLY else seen
+        heard = _GPS.get(row, Undisturbed()).apply([moment], 0, ego, [scenario.seed, index])
+        claimed = None if row == COBEVGLUE else heard.claimed
+        outputs[row] = system.collaborate(taking_part, ego, scene.time, claimed, seconds)
+    return replace(scene, tracked={name: view.boxes for name, view in seen.items()}, outputs=outputs)
+
+
+def _scene(
+    scenario: SimulatedScenario, index: int, ego: str, views: Mapping[str, LidarView], reach: EvaluationRange
+) -> DemoFrame:
+    """One frame as it is, before anybody looked."""
+    time, snapshot = index / RATE, scenario.traffic[index]
+    agents = {name: _agent_frame(view) for name, view in views.items()}
+    truth = Frame(scenario.name, scenario.timestamp(index), time, agents).ground_truth(ego)
+    assert truth.track_id is not None
+    counts = {name: _counts(view, truth.track_id) for name, view in views.items()}
+    speed = dict(zip(snapshot.id.tolist(), snapshot.speed.tolist(), strict=True))  # parked ones are not in there
+    ego_SE3_world = inverse_SE3(views[ego].world_SE3_lidar)
     return DemoFrame(
-        index=frame.index,
-        time=frame.time,
+        index=index,
+        time=time,
         ego=ego,
-        other=received,
-        alignment=alignment,
-        poses=poses,
-        objects=objects,
-        new_objects=len(set(theirs.object_id[real].tolist()) - {mine.own_id, *mine.object_id.tolist()}),
-        message_bytes=message_bytes,
-        align_seconds=seconds,
-        truth=truth[np.arange(len(truth)) != mine.own_id],
+        reach=reach,
+        world_SE2_ego=SE2.from_matrix(views[ego].world_SE3_lidar),
+        points={name: view.points for name, view in views.items()},
+        truth=truth,
+        point_count=np.sum(list(counts.values()), axis=0),
+        own_point_count=counts[ego],
+        speed=np.array([speed.get(vehicle, 0.0) for vehicle in truth.track_id.tolist()]),
+        ego_SE2_others={
+            name: SE2.from_matrix(ego_SE3_world @ view.world_SE3_lidar) for name, view in views.items() if name != ego
+        },
     )
 
 
-def _noisy_gps(frame: ObjectListFrame, level: float, seed: int) -> SE2:
-    """ego_SE2_other from the two cars' own positions, each with Gaussian noise of `level` metres and degrees."""
-    rng = np.random.default_rng([seed, _GPS_STREAM, frame.index])
-    claimed = []
-    for name in (EGO, OTHER):
-        pose, (x, y, yaw) = frame.agents[name].world_SE2_agent, level * rng.standard_normal(3)
-        claimed.append(SE2(pose.x + x, pose.y + y, pose.yaw + math.radians(yaw)))
-    return claimed[0].inverse() @ claimed[1]
+def _agent_frame(view: LidarView) -> AgentFrame:
+    return AgentFrame(lambda: (view.world_SE3_lidar, view.boxes), lambda: view.points)
 
 
-def _success(errors: list[tuple[float, float]], level: float) -> int:
-    """How many poses are off by at most `level` metres and degrees."""
-    return sum(metres <= level and radians <= math.radians(level) for metres, radians in errors)
+def _counts(view: LidarView, vehicles: IntArray) -> IntArray:
+    """(N,) points of one agent on each of these vehicles."""
+    assert view.boxes.track_id is not None
+    known = dict(zip(view.boxes.track_id.tolist(), view.point_count.tolist(), strict=True))
+    return np.array([known.get(vehicle, 0) for vehicle in vehicles.tolist()], dtype=np.int64)
 
 
 def _mean(values: Any) -> float | None:

@@ -1,9 +1,8 @@
-"""Pictures seen from above and report pages. Importing this imports matplotlib, but neither pyplot nor a display."""
+"""Pictures seen from above, and pages of them (`report_page`, `study_report`). Imports matplotlib, but not pyplot."""
 
 from cobevglue.visualization.alignment import draw_alignment
 from cobevglue.visualization.bev import draw_agent, draw_boxes, draw_object_graph, draw_pairs
 from cobevglue.visualization.detections import draw_detections, draw_points
-from cobevglue.visualization.report_page import Section, Table, write_page
 from cobevglue.visualization.style import EGO, MATCH, OTHER, TRUTH, add_axes, new_figure, save_figure, style_bev
 
 __all__ = [
@@ -11,8 +10,6 @@ __all__ = [
     "MATCH",
     "OTHER",
     "TRUTH",
-    "Section",
-    "Table",
     "add_axes",
     "draw_agent",
     "draw_alignment",
@@ -24,5 +21,4 @@ __all__ = [
     "new_figure",
     "save_figure",
     "style_bev",
-    "write_page",
 ]

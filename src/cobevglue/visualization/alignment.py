@@ -19,7 +19,7 @@ from cobevglue.visualization.style import EGO, OTHER, add_axes, legend_below, ne
 if TYPE_CHECKING:
     from cobevglue.alignment import Alignment
 
-__all__ = ["draw_alignment"]
+__all__ = ["draw_alignment", "draw_together"]
 
 _NUMBERS_AT_MOST = 12
 
@@ -50,19 +50,38 @@ def draw_alignment(
         middle, other, OTHER, common=matches[:, 1], names=names, filled=False, label=f"boxes of {other_name}"
     )
     draw_agent(middle, OTHER, label=other_name)
-    _draw_together(right, ego, other, alignment, ego_name, other_name)
+    draw_together(right, ego, other, alignment, ego_name=ego_name, other_name=other_name, number="3  ")
     same_scale([left, middle, right])
     legend_below(figure)
     return figure
 
 
-def _draw_together(axes: Axes, ego: Boxes, other: Boxes, alignment: Alignment, ego_name: str, other_name: str) -> None:
-    """The ego's boxes and, unless refused, the other's moved by the pose that was found."""
-    draw_boxes(axes, ego, EGO)
-    draw_agent(axes, EGO)
+def draw_together(
+    axes: Axes,
+    ego: Boxes,
+    other: Boxes,
+    alignment: Alignment,
+    *,
+    ego_name: str = "ego",
+    other_name: str = "other",
+    number: str = "",
+) -> None:
+    """The ego's boxes and, unless refused, the other's moved by the pose that was found, matched ones joined.
+
+    Args:
+        axes: the plot, in the ego's frame.
+        ego: M boxes in the ego's frame.
+        other: N boxes in the other's frame.
+        alignment: what was found, or a refusal: the plot then says why.
+        ego_name: what the legend calls the ego.
+        other_name: what the legend calls the other.
+        number: what the title begins with.
+    """
+    draw_boxes(axes, ego, EGO, label=f"boxes of {ego_name}")
+    draw_agent(axes, EGO, label=ego_name)
     pose = alignment.ego_SE2_other
     if pose is None:
-        style_bev(axes, "3  Refused: no pose, nothing is moved")
+        style_bev(axes, f"{number}Refused: no pose, nothing is moved")
         reason = textwrap.fill(alignment.reason, 46)
         frame = {"facecolor": "white", "edgecolor": "#999999", "boxstyle": "round,pad=0.4"}
         axes.text(
@@ -70,10 +89,10 @@ def _draw_together(axes: Axes, ego: Boxes, other: Boxes, alignment: Alignment, e
         )
         return
     where = f"x {pose.x:.1f} m, y {pose.y:.1f} m, yaw {math.degrees(wrap_angle(pose.yaw)):.1f}°"
-    style_bev(axes, f"3  Together: {where}")
+    style_bev(axes, f"{number}Together: {where}")
     moved = other.transform(pose)
-    draw_boxes(axes, moved, OTHER, filled=False)
-    draw_agent(axes, OTHER, x=pose.x, y=pose.y, yaw=pose.yaw)
+    draw_boxes(axes, moved, OTHER, label=f"boxes of {other_name}", filled=False)
+    draw_agent(axes, OTHER, x=pose.x, y=pose.y, yaw=pose.yaw, label=other_name)
     draw_pairs(axes, ego[alignment.matches[:, 0]], moved[alignment.matches[:, 1]])
 
 

@@ -1,148 +1,134 @@
-"""The pictures of the demonstration: where the other car's boxes end up, with which pose."""
+"""The pictures of the demonstration: one moment as each row has it, and how two cars found each other."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from cobevglue.demo import BEVGLUE, EGO, OTHER, POSE_SOURCES, TRUE_POSE, DemoFrame, DemoResult
-from cobevglue.visualization import style
+from cobevglue.demo import COBEVGLUE, EGO_ONLY, ROWS, DemoFrame, DemoResult
+from cobevglue.se2 import SE2
+from cobevglue.simulation.road_network import Lane, RoadNetwork
+from cobevglue.typing import Float32Array, FloatArray
+from cobevglue.visualization.alignment import draw_alignment
 from cobevglue.visualization.bev import draw_agent, draw_boxes
 from cobevglue.visualization.style import (
-    GIVEN_POSE,
+    EGO,
     MATCH,
-    TRUTH,
+    OTHER,
     add_axes,
     legend_below,
-    light_grid,
     new_figure,
     set_title,
     style_bev,
 )
 
-__all__ = ["draw_errors_over_time", "draw_placements", "typical_frame", "write_animation"]
+__all__ = ["draw_comparison", "draw_moment", "draw_pose", "lane_polygon", "thinned", "witness"]
 
-_VIEW = 72.0  # the ego's surroundings that are shown, to each side [m]
-_FRAMES_PER_PICTURE, _FRAMES_PER_SECOND = 2, 5
-_LINES = {
-    "gps_attacked": {"color": "black", "linewidth": 1.6},
-    "gps_2.5": {"color": GIVEN_POSE, "linewidth": 1.6},
-    "gps_0.5": {"color": GIVEN_POSE, "linewidth": 1.6, "linestyle": (0, (4, 2))},
-    BEVGLUE: {"color": MATCH, "linewidth": 2.6},
-    TRUE_POSE: {"color": TRUTH, "linewidth": 1.6, "linestyle": (0, (1, 1))},
-}
-"""How each pose source is drawn over time, the worst first."""
+_VIEW = (-62.0, 62.0, -39.0, 39.0)  # x_min, x_max, y_min, y_max of the ego's surroundings that are shown [m]
+_ROAD, _HIDDEN, _GHOST = "#ECEEF0", "#E69F00", "#D4002A"
+_GROUND = -1.6  # points below this are left out of pictures [m]
+_CELL = 0.4  # of the others, one in each square of this side is drawn [m]
 
 
-def typical_frame(result: DemoResult) -> DemoFrame:
-    """The frame to show: of those that BEVGlue accepted the one with the median error, else the middle one."""
-    accepted = [(error, frame.index) for frame in result.frames if (error := frame.pose_error) is not None]
-    if not accepted:
-        return result.frames[len(result.frames) // 2]
-    return result.frames[sorted(accepted)[len(accepted) // 2][1]]
-
-
-def draw_placements(
-    frame: DemoFrame, sources: Sequence[str] = ("gps_2.5", "gps_attacked", BEVGLUE, TRUE_POSE)
+def draw_comparison(
+    result: DemoResult, rows: Sequence[str] = (EGO_ONLY, "noisy_gps", "attacked_gps", COBEVGLUE)
 ) -> Figure:
-    """The other's boxes placed with different poses over the vehicles as they really stand, in the ego's frame.
+    """The story's moment as several rows have it, two plots in a line.
 
     Args:
-        frame: one frame of the demonstration.
-        sources: keys of `POSE_SOURCES`; a plot each, two in a row.
+        result: the drive.
+        rows: keys of `ROWS`.
     """
-    rows = (len(sources) + 1) // 2
-    figure = new_figure(11.0, 5.7 * rows + 0.4)
-    for axes, source in zip(add_axes(figure, rows, 2), sources, strict=False):
-        _draw_placement(axes, frame, source)
-    legend_below(figure)
+    lines = (len(rows) + 1) // 2
+    figure = new_figure(14.0, 4.75 * lines + 0.5)
+    for axes, row in zip(add_axes(figure, lines, 2), rows, strict=False):
+        draw_moment(axes, result.story(), row, result.roads)
+    legend_below(figure, columns=7)
     return figure
 
 
-def draw_errors_over_time(result: DemoResult) -> Figure:
-    """How far the other's boxes are from their objects in each frame, with each pose source; and what was matched."""
-    figure = new_figure(11.0, 6.2)
-    upper, lower = add_axes(figure, 2, 1, heights=(3.0, 1.0))
-    times = [frame.time for frame in result.frames]
-    for source, line in _LINES.items():
-        errors = [frame.placement_error(source) for frame in result.frames]
-        means = [np.nan if error is None or not len(error) else float(error.mean()) for error in errors]
-        upper.plot(times, means, label=POSE_SOURCES[source], **line)  # type: ignore[arg-type]
-    upper.set_yscale("log")
-    upper.set_ylabel("mean error [m]")
-    upper.yaxis.set_major_formatter("{x:g}")
-    set_title(upper, f"How far the boxes from {OTHER} are from their objects")
-    matched = [len(frame.alignment.matches) for frame in result.frames]
-    lower.bar(times, matched, width=0.08, color=MATCH, alpha=0.6, label="matched objects")
-    refused = [frame.time for frame in result.frames if frame.poses[BEVGLUE] is None]
-    if refused:
-        lower.plot(refused, np.zeros(len(refused)), "x", color="black", clip_on=False, label="BEVGlue refused")
-    lower.set_ylabel("objects")
-    lower.set_xlabel("time [s]")
-    set_title(lower, "Objects that BEVGlue matched")
-    for axes in (upper, lower):
-        light_grid(axes)
-        axes.set_xlim(times[0] - 0.1, times[-1] + 0.1)
-    legend_below(figure, columns=4)
-    return figure
-
-
-def write_animation(result: DemoResult, path: str | Path, sources: Sequence[str] = ("gps_2.5", BEVGLUE)) -> Path:
-    """An animated GIF of `draw_placements`, one plot beside the other, in real time.
+def draw_moment(axes: Axes, frame: DemoFrame, row: str, roads: RoadNetwork) -> None:
+    """What is there, what was found, and what was made up, in the ego's frame.
 
     Args:
-        result: the sequence.
-        path: the file; its folder is made if it is not there.
-        sources: keys of `POSE_SOURCES`.
-
-    Returns:
-        The file.
+        axes: an empty plot.
+        frame: the moment.
+        row: a key of `ROWS`.
+        roads: for orientation; the system does not know them.
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    figure = new_figure(5.0 * len(sources), 5.7)
-    plots = add_axes(figure, 1, len(sources))
-    writer = PillowWriter(fps=_FRAMES_PER_SECOND)
-    with writer.saving(figure, str(target), dpi=80):
-        for frame in result.frames[::_FRAMES_PER_PICTURE]:
-            for axes, source in zip(plots, sources, strict=True):
-                for artist in (*axes.collections, *axes.lines):
-                    artist.remove()
-                _draw_placement(axes, frame, source, size=10.5)
-            if frame.index == 0:
-                legend_below(figure, columns=4)
-                figure.draw_without_rendering()
-                figure.set_layout_engine(None)  # the plots stay where they are; computing that takes longest
-            writer.grab_frame()
-    return target
+    verdict, truth = frame.verdict(row), frame.truth
+    _draw_roads(axes, roads, frame)
+    _draw_clouds(axes, frame, row)
+    missed = frame.counted & ~verdict.found
+    draw_boxes(axes, truth[missed], "black", label="missed", filled=False, linewidth=1.0, linestyle=":")
+    draw_boxes(axes, truth[verdict.found & ~frame.hidden], EGO, label="found", linewidth=1.2)
+    draw_boxes(axes, truth[verdict.found & frame.hidden], MATCH, label="found, hidden from the ego", linewidth=2.2)
+    draw_boxes(
+        axes, verdict.boxes[verdict.ghost], _GHOST, label="ghost: a box without a vehicle", linewidth=1.8, zorder=3.5
+    )
+    at = truth.center[frame.hidden]
+    axes.scatter(
+        at[:, 0], at[:, 1], s=420.0, facecolors="none", edgecolors=_HIDDEN, linewidths=1.5, label="hidden from the ego"
+    )
+    draw_agent(axes, EGO, label="the ego")
+    for pose in frame.used_poses(row).values():
+        draw_agent(axes, OTHER, x=pose.x, y=pose.y, yaw=pose.yaw)
+    axes.scatter(
+        [], [], s=120.0, marker=">", color=OTHER, edgecolors="black", label="another car, where the ego has it"
+    )
+    style_bev(axes, "")
+    counted = f"{verdict.found.sum()} of {frame.counted.sum()} found, {verdict.ghost.sum()} ghosts"
+    set_title(axes, f"{ROWS[row][0].upper()}{ROWS[row][1:]}: {counted}")
+    x_min, x_max, y_min, y_max = _VIEW
+    axes.set_xlim(x_min, x_max)
+    axes.set_ylim(y_min, y_max)
 
 
-def _draw_placement(axes: Axes, frame: DemoFrame, source: str, size: float = 12.0) -> None:
-    """The boxes of one frame, placed with one pose."""
-    draw_boxes(axes, frame.truth, TRUTH, label="where vehicles really are", linewidth=0.8)
-    draw_agent(axes, style.EGO, label=f"{EGO}, the ego")
-    pose, errors = frame.poses[source], frame.placement_error(source)
-    if pose is None or errors is None:
-        title = f"{POSE_SOURCES[source]}: refused"
-    else:
-        color = {BEVGLUE: MATCH, TRUE_POSE: "black"}.get(source, GIVEN_POSE)
-        placed = frame.other.transform(pose)
-        draw_boxes(axes, placed, color, filled=False, linewidth=1.7)
-        draw_agent(axes, color, x=pose.x, y=pose.y, yaw=pose.yaw)
-        real = np.isfinite(frame.objects[:, 0])
-        gaps = np.stack([placed.center[real, :2], frame.objects[real]], axis=1)
-        axes.add_collection(LineCollection(list(gaps), colors=color, linewidths=1.0, linestyles=":", zorder=2.5))
-        title = f"{POSE_SOURCES[source]}: boxes {errors.mean():.1f} m off" if len(errors) else POSE_SOURCES[source]
-    # Stand-ins for the legend: the colour differs from plot to plot.
-    axes.plot([], [], "s", color="black", markersize=9, markerfacecolor="none", label=f"boxes from {OTHER}, placed")
-    axes.plot([], [], ":", color="black", label="from there to the vehicle")
-    style_bev(axes, title)
-    set_title(axes, title, size)
-    axes.set_xlim(-_VIEW, _VIEW)
-    axes.set_ylim(-_VIEW, _VIEW)
+def draw_pose(result: DemoResult) -> Figure:
+    """How the ego found another car in the story's moment: both object graphs, and what they have in common."""
+    frame, name = result.story(), witness(result)
+    alignment = frame.outputs[COBEVGLUE].alignments[name]
+    ego, other = frame.tracked[frame.ego], frame.tracked[name]
+    return draw_alignment(ego, other, alignment, ego_name=f"{frame.ego}, the ego", other_name=name)
+
+
+def witness(result: DemoResult) -> str:
+    """The agent nearest to what is hidden in the story's moment: whose help matters most."""
+    frame = result.story()
+    movers = frame.hidden_movers
+    at = frame.truth.center[movers[0], :2] if len(movers) else np.zeros(2)
+    return min(frame.ego_SE2_others, key=lambda name: float(np.hypot(*(frame.ego_SE2_others[name].translation - at))))
+
+
+def lane_polygon(lane: Lane) -> FloatArray:
+    """(2 N, 2) outline of a lane with N points, in the world's frame."""
+    along = np.gradient(lane.centerline, axis=0)
+    along /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
+    left = lane.width / 2.0 * np.column_stack([-along[:, 1], along[:, 0]])
+    return np.concatenate([lane.centerline + left, (lane.centerline - left)[::-1]])
+
+
+def thinned(points: Float32Array) -> Float32Array:
+    """(M, 2) x and y of points above the ground, one for each small square that has any."""
+    above = points[points[:, 2] > _GROUND, :2]
+    _, first = np.unique(np.floor(above / _CELL), axis=0, return_index=True)
+    return above[np.sort(first)]
+
+
+def _draw_roads(axes: Axes, roads: RoadNetwork, frame: DemoFrame) -> None:
+    ego_SE2_world = frame.world_SE2_ego.inverse()
+    areas = [lane_polygon(lane) for lane in roads.lanes] + [junction.polygon for junction in roads.junctions]
+    polygons = PolyCollection([ego_SE2_world.apply(area) for area in areas], facecolors=_ROAD, zorder=0.4)
+    axes.add_collection(polygons, autolim=False)
+
+
+def _draw_clouds(axes: Axes, frame: DemoFrame, row: str) -> None:
+    """The ego's points, and those of the others where the ego has them."""
+    clouds = [(frame.ego, SE2(), EGO), *((name, pose, OTHER) for name, pose in frame.used_poses(row).items())]
+    for name, ego_SE2_agent, color in reversed(clouds):
+        x, y = ego_SE2_agent.apply(thinned(frame.points[name])).T
+        axes.scatter(x, y, s=0.9, color=color, alpha=0.6, linewidths=0.0, zorder=1.0, rasterized=True)

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cobevglue
-from cobevglue.demo import BEVGLUE, EGO, OTHER, POSE_SOURCES, DemoFrame, DemoResult
-from cobevglue.visualization.alignment import draw_alignment
-from cobevglue.visualization.demo_pictures import (
-    draw_errors_over_time,
-    draw_placements,
-    typical_frame,
-    write_animation,
-)
-from cobevglue.visualization.report_page import Section, Table, write_page
+from cobevglue.demo import COBEVGLUE, IOU, MIN_POINTS, NETWORK, NOISE, ROWS, SCORE, DemoFrame, DemoResult
+from cobevglue.visualization.demo_pictures import draw_comparison, draw_pose, witness
+from cobevglue.visualization.demo_player import player
+from cobevglue.visualization.report_page import Part, figure, paragraphs, table, write_page
 from cobevglue.visualization.style import save_figure
 
-__all__ = ["write_demo_report"]
+__all__ = ["comparison_table", "write_demo_report"]
 
-GRAPHS, PLACEMENTS, ERRORS = "object_graphs.png", "placements.png", "error_over_time.png"
-ANIMATION, PAGE = "animation.gif", "index.html"
+PAGE, COMPARISON, POSE = "index.html", "comparison.png", "pose.png"
 
 
 def write_demo_report(
@@ -41,151 +36,182 @@ def write_demo_report(
         OSError: a file cannot be written.
     """
     target = Path(folder)
-    frame = typical_frame(result)
-    makers: dict[str, Callable[[Path], Path]] = {
-        GRAPHS: lambda path: save_figure(
-            draw_alignment(frame.ego, frame.other, frame.alignment, ego_name=EGO, other_name=OTHER), path
-        ),
-        PLACEMENTS: lambda path: save_figure(draw_placements(frame), path),
-        ERRORS: lambda path: save_figure(draw_errors_over_time(result), path),
-        ANIMATION: lambda path: write_animation(result, path),
-    }
     pictures = []
-    for name, make in makers.items():
+    for name, draw in ((COMPARISON, draw_comparison), (POSE, draw_pose)):
         if progress is not None:
             progress(name)
-        pictures.append(make(target / name))
+        pictures.append(save_figure(draw(result), target / name))
     if progress is not None:
         progress(PAGE)
-    return [_write_page(result.summary(), frame, target), *pictures]
+    return [_write_page(result, target), *pictures]
 
 
-def _write_page(summary: dict[str, Any], frame: DemoFrame, folder: Path) -> Path:
-    objects, alignment = summary["objects_per_frame"], summary["alignment"]
-    sections = [
-        Section(
-            "Where do the other car's boxes end up?",
-            [
-                f"{OTHER} sends what it sees. To use it, {EGO} must know where {OTHER} is. If that is wrong, every box "
-                "lands in the wrong place: a parked car stands in the middle of the lane. The table says how far the "
-                "boxes are from the vehicles that they are of, depending on where the relative pose comes from.",
-                "Even with the true pose something remains: the detector itself is not exact. No pose can do better.",
-            ],
-            table=_placement_table(summary),
-        ),
-        Section(
-            "The drive",
-            [
-                f"Everything is drawn as {EGO} sees it: it stays at the origin and looks to the right. Grey is where "
-                f"the vehicles really are. Left: the boxes that {OTHER} sent, placed by a noisy GPS. Right: the same "
-                "boxes, placed by BEVGlue. In a frame that BEVGlue refuses, nothing is placed.",
-            ],
-            picture=folder / ANIMATION,
-            picture_text="Animation: the same boxes over time, placed by noisy GPS (left) and by BEVGlue (right).",
-        ),
-        Section(
-            f"One moment, at {frame.time:.1f} s",
-            [
-                "The same boxes placed four times. Dotted lines lead from a box to the vehicle that it is of. Under "
-                f"attack, {OTHER} claims to stand where {EGO} stands. This is the frame in which BEVGlue's error is "
-                "the median of the drive, not its best one.",
-            ],
-            picture=folder / PLACEMENTS,
-            picture_text="Four maps: boxes placed with noisy GPS, attacked GPS, BEVGlue and the true pose.",
-        ),
-        Section(
-            "How BEVGlue does it",
-            [
-                "Each car turns its boxes into a graph: the objects are nodes, and the distances, directions and "
-                "headings between them are edges. These do not depend on where a car believes to be. BEVGlue "
-                "looks for the part that both graphs have in common (green, the same numbers left and in the middle). "
-                "The motion that brings one onto the other is the relative pose (right).",
-            ],
-            picture=folder / GRAPHS,
-            picture_text="Two object graphs with their common part in green, and the boxes of both in one frame.",
-        ),
-        Section(
-            "Over time",
-            [
-                "Each line is the mean distance between the boxes and their vehicles; mind that the scale is "
-                "logarithmic. A gap in the green line is a refusal: BEVGlue says so if what it found could be chance.",
-            ],
-            picture=folder / ERRORS,
-            picture_text="Lines over time: the error of boxes with each pose source, and how many objects matched.",
-        ),
-        Section(
-            "The numbers",
-            [
-                f"All {summary['frames']} frames count. A refusal is not a success. A wrong accept is a pose that was "
-                "accepted although it is off by more than 3 m or 3°.",
-            ],
-            table=_number_table(summary),
-        ),
-        Section(
-            "What this is, and what it is not",
-            [
-                "The junction is simulated, with vehicles on scripted paths. There is no LiDAR and no neural network "
-                "here: the boxes are the true ones, with the errors that a detector makes (displaced, missed, turned "
-                "round, invented). BEVGlue gets the boxes of the two cars, each in its own frame, and no position.",
-                f"{EGO} sees {objects['ego']:.0f} objects a frame. The message adds {objects['new_from_other']:.0f} "
-                f"that it did not detect itself, for {summary['message_bytes_per_frame']:.0f} bytes. An alignment "
-                f"takes {alignment['median_ms']:.2f} ms.",
-            ],
-        ),
+def comparison_table(summary: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The comparison as text.
+
+    Args:
+        summary: as `DemoResult.summary` returns it.
+
+    Returns:
+        The names of the columns, and a row for each of `ROWS`.
+    """
+    header = [
+        "",
+        "AP 0.5",
+        "AP 0.7",
+        f"found, of {summary['vehicles']:.1f}",
+        f"hidden found, of {summary['hidden_from_ego']:.1f}",
+        "ghosts",
+        "pose off by",
+        "bytes for the pose",
+        "bytes in all",
     ]
+    rows = []
+    for name, row in zip(ROWS.values(), summary["rows"].values(), strict=True):
+        scores = [_number(row[key], 3) for key in ("ap_0.5", "ap_0.7")]
+        counts = [_number(row[key], 1) for key in ("found", "hidden_found", "ghosts")]
+        sizes = [_number(row[key] or 0.0, 0) for key in ("bytes_for_pose", "bytes_in_all")]
+        rows.append([name, *scores, *counts, _pose_error(row), *sizes])
+    return header, rows
+
+
+def _write_page(result: DemoResult, folder: Path) -> Path:
+    summary, story = result.summary(), result.story()
+    header, rows = comparison_table(summary)
+    parts = [
+        Part(
+            "At a glance",
+            paragraphs(_story(story))
+            + figure(
+                (folder / COMPARISON).read_bytes(),
+                "The same moment four times, as the ego has it: it stands in the middle and looks to the right. Dots "
+                "are what the LiDARs measured, blue the ego's own, orange the others', placed where the ego believes "
+                "the others to be. Grey are the roads, for orientation.",
+                "Four maps: the ego alone, fused on noisy GPS, fused under attack, and CoBEVGlue.",
+            ),
+        ),
+        Part(
+            "The comparison",
+            table(header, rows, [list(ROWS).index(COBEVGLUE)], _table_notes(summary)),
+        ),
+        Part(
+            "The drive",
+            paragraphs(
+                "Choose how what the cars saw is put together, and watch where the orange points come to lie: they are "
+                "what the others measured, placed where the ego believes the others to be. With the true poses they "
+                "continue the ego's own, blue ones. Under attack they are somewhere else."
+            )
+            + player(result),
+        ),
+        Part(
+            f"How {story.ego} finds {witness(result)}",
+            paragraphs(
+                "Each car makes a graph of what it detected: objects are nodes; distances, directions and headings "
+                "between them are edges. None of these depends on where a car believes to be. BEVGlue looks for the "
+                "part that both graphs have in common (green, equal numbers). The motion that brings one onto the "
+                "other is the relative pose. Where that could be chance, BEVGlue refuses, and the other car is left "
+                "out of this frame."
+            )
+            + figure(
+                (folder / POSE).read_bytes(),
+                "What both cars track in the moment above, each in its own frame, and together.",
+                "Two object graphs with their common part in green, and the boxes of both in one frame.",
+            ),
+        ),
+        Part("What the bytes are", paragraphs(_bytes(summary))),
+        Part("What this is, and what it is not", paragraphs(_limits(summary))),
+    ]
+    seed = summary["seed"]
     footer = (
-        f"cobevglue {cobevglue.__version__}, seed {summary['seed']}, Python {summary['machine']['python']} on "
-        f"{summary['machine']['processor']}. Again: cobevglue demo --seed {summary['seed']}"
+        f"cobevglue {cobevglue.__version__}, seed {seed}, Python {summary['machine']['python']} on "
+        f"{summary['machine']['processor']}. Again: cobevglue demo --seed {seed}"
     )
     lead = (
-        "Two cars meet at a junction. Each sees only some of the vehicles around. They share what they see, and "
-        "find out where the other one is from the vehicles that both see. GPS, which can be off, "
-        "jammed or faked, is not used."
+        f"{_count(summary['agents'])} cars with LiDARs meet at a junction. Each sees vehicles that the others cannot. "
+        "They share what they see; but to use it, a car must know where the others are. Most systems ask GPS, which "
+        "can be off, jammed or faked. CoBEVGlue does not: it finds the others by the vehicles that both see."
     )
-    return write_page(folder / PAGE, "Seeing together without trusting GPS", lead, sections, footer)
+    return write_page(folder / PAGE, "Seeing together without trusting GPS", lead, parts, footer)
 
 
-def _placement_table(summary: dict[str, Any]) -> Table:
-    rows = []
-    for source, name in POSE_SOURCES.items():
-        placement = summary["placement"][source]
-        rows.append(
-            [
-                name,
-                _metres(placement["mean_error_m"]),
-                _percent(placement["boxes_within_2m"]),
-                _percent(placement["frames"]),
-            ]
+def _story(frame: DemoFrame) -> str:
+    text = (
+        f"At {frame.time:.1f} s there are {frame.counted.sum()} vehicles in reach of {frame.ego}, the ego. "
+        f"{frame.hidden.sum()} of them (orange rings) it cannot find by itself: other vehicles or walls hide them. "
+    )
+    movers = frame.hidden_movers
+    if len(movers):
+        row = int(movers[0])
+        x, y = frame.truth.center[row, :2]
+        own = frame.own_point_count[row]
+        found = [ROWS[name] for name in ROWS if frame.verdict(name).found[row]]
+        missed = [name for name in ROWS.values() if name not in found]
+        text += (
+            f"One of these drives at {3.6 * frame.speed[row]:.0f} km/h, {abs(x):.0f} m "
+            f"{'ahead' if x > 0 else 'behind'} and {abs(y):.0f} m to the {'left' if y > 0 else 'right'}: {own} of the "
+            "ego's points lie on it, and "
+            f"{frame.point_count[row] - own} of the others'. It was found by: {_listed(found)}; and missed by: "
+            f"{_listed(missed)}. "
         )
-    header = ["the pose comes from", "mean distance to the vehicle", "boxes within 2 m", "frames with a pose"]
-    return Table(header, rows, strong=list(POSE_SOURCES).index(BEVGLUE))
+    return text + (
+        "\n\nThe moment was chosen by what is there, not by what was found: it is the first of those in which most "
+        "hidden vehicles drive within 50 m."
+    )
 
 
-def _number_table(summary: dict[str, Any]) -> Table:
-    alignment = summary["alignment"]
-    rows = [
-        ("success within 1 m and 1°", _percent(alignment["success_1m_1deg"])),
-        ("success within 2 m and 2°", _percent(alignment["success_2m_2deg"])),
-        ("success within 3 m and 3°", _percent(alignment["success_3m_3deg"])),
-        ("refused", _percent(alignment["refused"])),
-        ("wrong accepts", _percent(alignment["wrong_accepts"])),
-        ("median error of accepted poses", _median_error(alignment)),
-        ("objects matched in a frame", f"{summary['objects_per_frame']['matched']:.1f}"),
-        ("message", f"{summary['message_bytes_per_frame']:.0f} bytes a frame"),
-        ("time of an alignment, median", f"{alignment['median_ms']:.2f} ms"),
+def _table_notes(summary: dict[str, Any]) -> list[str]:
+    return [
+        f"All rows: {summary['frames']} frames, the same clouds and detector and, but for ego only, the same fusion.",
+        "AP: average precision at that overlap with the true box, seen from above; 1 is perfect.",
+        f"Found, hidden, ghosts: numbers a frame, at a score of {SCORE:g} and an overlap of {IOU:g} or more. Vehicles "
+        f"count that at least {MIN_POINTS} points of all LiDARs together lie on; hidden ones have fewer than "
+        f"{MIN_POINTS} of the ego's. A ghost is a box that overlaps no vehicle by that much.",
+        f"Noisy GPS: Gaussian, standard deviation {NOISE.position:g} m in x and in y and {NOISE.yaw:g}° in heading, "
+        "for every car anew in every frame. Under attack: the others claim to be where the ego is.",
+        "Pose off by: median over frames and cars, of the poses that were used. CoBEVGlue used "
+        f"{100.0 * (summary['rows'][COBEVGLUE]['poses_used'] or 0.0):.0f} % of them, and refused the rest.",
+        "Bytes: a frame and car that helps, as encoded.",
     ]
-    return Table(["BEVGlue", ""], rows)
 
 
-def _median_error(alignment: dict[str, Any]) -> str:
-    if alignment["median_error_m"] is None:
+def _bytes(summary: dict[str, Any]) -> str:
+    row = summary["rows"][COBEVGLUE]
+    given = summary["rows"]["noisy_gps"]["bytes_for_pose"]
+    if row["bytes_for_pose"] is None or given is None:
+        return "No other car was there."
+    features = row["bytes_in_all"] - row["bytes_for_pose"]
+    return (
+        "Nearly all that a car sends is what its network makes of its cloud, three maps of features: "
+        f"{features:,.0f} bytes a frame, in every row. To place them by GPS takes a pose, {given:,.0f} bytes. "
+        f"CoBEVGlue sends what the car tracks instead, 32 bytes a box: {row['bytes_for_pose']:,.0f} bytes, "
+        f"{100.0 * row['bytes_for_pose'] / features:.2f} % of the features."
+    )
+
+
+def _limits(summary: dict[str, Any]) -> str:
+    times = ", ".join(f"{stage} {ms:.0f} ms" for stage, ms in summary["median_ms"].items() if ms is not None)
+    return (
+        f"Traffic and LiDARs are simulated, on a road network ({NETWORK}) that nothing was trained on. Detector, "
+        "tracker, alignment and fusion are those that run on real clouds. CoBEVGlue gets clouds only: no pose, no map, "
+        "no roads. The ego is the car from which most driving vehicles are hidden, so that there is something to gain."
+        f"\n\nTime for a frame of {summary['agents']} cars, the median here: {times or 'not measured'}. On the road, "
+        "every car has its own computer for its perception."
+    )
+
+
+def _pose_error(row: dict[str, Any]) -> str:
+    if row["median_error_m"] is None:
         return "–"
-    return f"{alignment['median_error_m']:.2f} m, {alignment['median_error_deg']:.2f}°"
+    return f"{row['median_error_m']:.2f} m, {row['median_error_deg']:.1f}°"
 
 
-def _metres(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f} m"
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100.0 * share:.1f} %"
+def _count(number: int) -> str:
+    return {1: "One", 2: "Two", 3: "Three", 4: "Four"}.get(number, str(number))
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) if names else "nobody"

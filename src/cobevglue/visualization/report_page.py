@@ -1,121 +1,159 @@
-"""A report as one HTML file: text, tables and pictures inside, nothing loaded from anywhere."""
+"""Building blocks of report pages: one HTML file each, everything inside, nothing loaded from anywhere.
+
+Text given to any of these is plain text; what they return is HTML.
+"""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-__all__ = ["Section", "Table", "write_page"]
+from cobevglue.datasets.whole_files import whole_file
 
-_IMAGE_TYPES = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml"}
+__all__ = ["Part", "figure", "paragraphs", "table", "write_page"]
 
 _STYLE = """
-body { margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 70rem; color: #1b1f24; background: #ffffff;
+:root { color-scheme: light dark; --text: #1b1f24; --page: #ffffff; --line: #dfe3e8; --faint: #57606a; --good: #00674b;
+        --inset: #f4f6f8; --link: #00578a; }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #e4e8ec; --page: #15181c; --line: #343a41; --faint: #9aa4ae; --good: #4fd1a5; --inset: #20252b;
+          --link: #7cc0f0; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 74rem; color: var(--text); background: var(--page);
        font: 17px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+a { color: var(--link); }
 h1 { font-size: 2rem; line-height: 1.2; margin: 0 0 0.6rem; }
-h2 { font-size: 1.3rem; margin: 2.8rem 0 0.5rem; }
-p { max-width: 44rem; margin: 0.5rem 0 1rem; }
+h2 { font-size: 1.3rem; margin: 2.8rem 0 0.5rem; scroll-margin-top: 1rem; }
+h3 { font-size: 1rem; margin: 1.6rem 0 0.3rem; }
+p { max-width: 46rem; margin: 0.5rem 0 1rem; }
+pre { overflow-x: auto; padding: 0.7rem 1rem; background: var(--inset); border-radius: 6px; font-size: 0.85rem; }
 .lead { font-size: 1.12rem; }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.45rem 1.1rem 0.45rem 0; text-align: right; border-bottom: 1px solid #dfe3e8; }
+nav ol { columns: 20rem; max-width: 60rem; padding-left: 1.4rem; }
+table { border-collapse: collapse; margin: 0.6rem 0; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.45rem 1.1rem 0.45rem 0; text-align: right; white-space: nowrap;
+         border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { text-align: left; }
-th { font-weight: 600; border-bottom: 2px solid #1b1f24; vertical-align: bottom; }
-tr.strong td { font-weight: 700; color: #00674b; }
-img { display: block; max-width: 100%; height: auto; margin: 0.8rem 0; }
+th { font-weight: 600; border-bottom: 2px solid var(--text); vertical-align: bottom; white-space: normal; }
+tr.strong td { font-weight: 700; color: var(--good); }
 .scroll { overflow-x: auto; }
-footer { margin-top: 3rem; padding-top: 0.8rem; border-top: 1px solid #dfe3e8; color: #57606a; font-size: 0.9rem; }
+.notes { margin: 0.2rem 0 1.2rem; padding-left: 1.2rem; max-width: 60rem; color: var(--faint); font-size: 0.88rem; }
+figure { margin: 1rem 0 1.6rem; }
+figure img { display: block; max-width: 100%; height: auto; border-radius: 6px; background: #ffffff; }
+figcaption { max-width: 60rem; margin-top: 0.4rem; color: var(--faint); font-size: 0.92rem; }
+footer { margin-top: 3rem; padding-top: 0.8rem; border-top: 1px solid var(--line); color: var(--faint);
+         font-size: 0.9rem; }
 """
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """A table of text.
+class Part:
+    """A part of a page.
 
     Attributes:
-        header: the names of the columns.
-        rows: the cells, as many in a row as there are columns; the first one names the row.
-        strong: the row that is set off, counted from 0, or None.
-    """
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    strong: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """A part of the page: heading, paragraphs, then a table and a picture if there are any.
-
-    Attributes:
-        heading: of the section.
-        paragraphs: plain text.
-        table: a table, or None.
-        picture: a `.png`, `.gif` or `.svg` file that is put into the page, or None.
-        picture_text: what the picture shows, for those who cannot see it.
+        heading: of the part, plain text.
+        html: what is under it, as the functions of this module return it.
     """
 
     heading: str
-    paragraphs: Sequence[str]
-    table: Table | None = None
-    picture: Path | None = None
-    picture_text: str = ""
+    html: str
 
 
-def write_page(path: str | Path, title: str, lead: str, sections: Sequence[Section], footer: str = "") -> Path:
-    """Write the report. It opens in any browser, from disk, without a network.
+def paragraphs(text: str) -> str:
+    """Paragraphs of plain text; an empty line ends one. One whose lines all begin with four spaces is kept as it is."""
+    parts = []
+    for block in (b for b in text.replace("\r\n", "\n").split("\n\n") if b.strip()):
+        lines = block.strip("\n").split("\n")
+        if all(line.startswith("    ") for line in lines):
+            parts.append(f"<pre>{escape(chr(10).join(line[4:] for line in lines))}</pre>")
+        else:
+            parts.append(f"<p>{escape(' '.join(line.strip() for line in lines))}</p>")
+    return "\n".join(parts)
+
+
+def table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], strong: Container[int] = (), notes: Sequence[str] = ()
+) -> str:
+    """A table of text, which scrolls by itself where it is wider than the page.
+
+    Args:
+        header: the names of the columns.
+        rows: the cells, as many in a row as there are columns; the first one names the row.
+        strong: numbers of the rows that are set off, from 0.
+        notes: what to know about it, in small print below.
+
+    Raises:
+        ValueError: a row has another number of cells than there are columns.
+    """
+    lines = []
+    for number, row in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"row {number} has {len(row)} cells, the table has {len(header)} columns")
+        start = '<tr class="strong">' if number in strong else "<tr>"
+        lines.append(f"{start}{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+    body = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+    below = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    return f'<div class="scroll">{body}</div>' + (f'<ul class="notes">{below}</ul>' if below else "")
+
+
+def figure(png: bytes, caption: str = "", text: str = "") -> str:
+    """A picture with its caption.
+
+    Args:
+        png: the picture as the bytes of a PNG file.
+        caption: below the picture.
+        text: what the picture shows, for those who cannot see it; the caption where left out.
+
+    Raises:
+        ValueError: these are not the bytes of a PNG file.
+    """
+    if not png.startswith(b"\x89PNG\r\n"):
+        raise ValueError(f"figure {caption!r}: not a PNG file, it starts with {png[:8]!r}")
+    data = base64.b64encode(png).decode("ascii")
+    image = f'<img src="data:image/png;base64,{data}" alt="{escape(text or caption)}">'
+    return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
+
+
+def write_page(
+    path: str | Path, title: str, lead: str, parts: Sequence[Part], footer: str = "", contents: bool = False
+) -> Path:
+    """Write a page that opens in any browser, from disk, without a network. It is there complete or not at all.
 
     Args:
         path: the file; its folder is made if it is not there.
         title: of the page.
-        lead: the paragraph under the title: what one sees here.
-        sections: the parts, in order.
+        lead: the paragraph under the title: what one sees here; "" for none.
+        parts: the page, in order.
         footer: small print.
+        contents: begin with a table of contents.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: a picture is of another kind.
-        OSError: a picture cannot be read or the page cannot be written.
+        OSError: the page cannot be written.
     """
-    parts = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(lead)}</p>']
-    for section in sections:
-        parts.append(f"<h2>{escape(section.heading)}</h2>")
-        parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
-        if section.table is not None:
-            parts.append(_table(section.table))
-        if section.picture is not None:
-            parts.append(f'<img src="{_data_url(section.picture)}" alt="{escape(section.picture_text)}">')
+    body = [f"<h1>{escape(title)}</h1>"]
+    if lead:
+        body.append(f'<p class="lead">{escape(lead)}</p>')
+    if contents:
+        entries = (f'<li><a href="#part-{i}">{escape(part.heading)}</a></li>' for i, part in enumerate(parts, start=1))
+        body.append(f"<nav><ol>{''.join(entries)}</ol></nav>")
+    for number, part in enumerate(parts, start=1):
+        body += [f'<h2 id="part-{number}">{escape(part.heading)}</h2>', part.html]
     if footer:
-        parts.append(f"<footer>{escape(footer)}</footer>")
+        body.append(f"<footer>{escape(footer)}</footer>")
     page = (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
-        + "\n".join(parts)
+        + "\n".join(body)
         + "\n</body>\n</html>\n"
     )
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(page, encoding="utf-8")
+    with whole_file(target) as partial:
+        partial.write_text(page, encoding="utf-8")
     return target
-
-
-def _table(table: Table) -> str:
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in table.header)
-    rows = []
-    for number, row in enumerate(table.rows):
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
-        start = '<tr class="strong">' if number == table.strong else "<tr>"
-        rows.append(f"{start}{cells}</tr>")
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
-
-
-def _data_url(picture: Path) -> str:
-    kind = _IMAGE_TYPES.get(picture.suffix.lower())
-    if kind is None:
-        raise ValueError(f"{picture}: a page shows {', '.join(_IMAGE_TYPES)} pictures only")
-    return f"data:{kind};base64,{base64.b64encode(picture.read_bytes()).decode('ascii')}"

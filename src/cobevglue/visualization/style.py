@@ -8,6 +8,7 @@ told from how it is drawn, too (the ego's are filled, the other's are outlines).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ __all__ = [
     "TRUTH",
     "add_axes",
     "check_picture_name",
+    "figure_png",
+    "is_cobevglue",
     "legend_below",
     "light_grid",
     "new_figure",
@@ -125,6 +128,18 @@ def legend_below(figure: Figure, columns: int = 6) -> None:
             named.setdefault(label, handle)
     with rc_context(_SETTINGS):
         figure.legend(list(named.values()), list(named), loc="outside lower center", ncol=columns)
+
+
+def is_cobevglue(name: str) -> bool:
+    """Whether a row or a line of this name is CoBEVGlue's, which is set off."""
+    return name.casefold().startswith("cobevglue")
+
+
+def figure_png(figure: Figure, dpi: float = 110.0) -> bytes:
+    """A picture as the bytes of a PNG file, `dpi` dots per inch."""
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    return file.getvalue()
 
 
 def picture_suffixes() -> list[str]:
