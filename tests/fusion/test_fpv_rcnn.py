@@ -35,6 +35,10 @@ def cars(*rows: tuple[float, float, float, float]) -> Boxes:
     return Boxes(np.column_stack([x, y, np.full(len(x), -1.0)]), np.tile(CAR, (len(x), 1)), yaw, score)
 
 
+def pose_of(boxes: Boxes, row: int) -> SE2:
+    return SE2(boxes.center[row, 0], boxes.center[row, 1], boxes.yaw[row])
+
+
 def scattered(seed: int, count: int = 4000) -> Float32Array:
     return np.random.default_rng(seed).uniform([-12, -6, -2, 0], [12, 6, 0.5, 1], (count, 4)).astype(np.float32)
 
@@ -47,7 +51,7 @@ def test_all_points_in_proposals_are_keypoints_while_there_are_few() -> None:
     boxes = cars((3.0, 1.0, 0.7, 0.9), (4.0, 2.0, 2.0, 0.5), (-8.0, -4.0, -1.0, 0.2))
     inside = np.zeros(len(points), dtype=bool)
     for row in range(len(boxes)):
-        box_SE2_lidar = SE2(*boxes.center[row, :2], boxes.yaw[row]).inverse()
+        box_SE2_lidar = pose_of(boxes, row).inverse()
         local = np.abs(box_SE2_lidar.apply(points[:, :3] - np.array([0.0, 0.0, -1.0])))
         inside |= (local <= np.array(CAR) / 2 + margin).all(axis=1)
     assert 100 < inside.sum() < 1000
@@ -170,7 +174,7 @@ def test_a_cell_is_the_maximum_over_its_keypoints() -> None:
         found = head.pool(*roi_inputs(boxes, points), torch.from_numpy(features)).numpy()
         expected = np.zeros((3, 12, 32))
         for row in range(3):
-            local = SE2(*boxes.center[row, :2], boxes.yaw[row]).inverse().apply(points + np.array([0.0, 0.0, 1.0]))
+            local = pose_of(boxes, row).inverse().apply(points + np.array([0.0, 0.0, 1.0]))
             for k, p in enumerate(local):
                 share = p / (np.array(CAR) + 0.6) + 0.5
                 if (share >= 0).all() and (share < 1).all():
@@ -212,7 +216,7 @@ def test_the_second_look_learns_to_move_boxes_to_their_points() -> None:
             p = rng.uniform(-0.5, 0.5, (40, 3)) * CAR
             side = rng.integers(2, size=40)
             p[np.arange(40), side] = np.sign(p[np.arange(40), side]) * np.array(CAR)[side] / 2  # on its four sides
-            p = SE2(*truth.center[box, :2], truth.yaw[box]).apply(p)
+            p = pose_of(truth, box).apply(p)
             points.append(p + np.array([0.0, 0.0, -1.0]))
         off = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.zeros(count)])
         proposals = truth.replace(center=truth.center + off, yaw=truth.yaw + rng.uniform(-0.1, 0.1, count))

@@ -144,7 +144,8 @@ def test_cells_of_the_map_at_stride_4_are_where_warping_takes_them_to_be() -> No
     """A map at stride 2 turned by 180 degrees, then halved, is the halved one turned."""
     with torch.inference_mode():
         down = method_with_weights().down
-        down[0].weight.copy_(down[0].weight + down[0].weight.flip(2, 3))  # a kernel that turning leaves as it is
+        kernel = next(down.parameters())
+        kernel.copy_(kernel + kernel.flip(2, 3))  # turning leaves it as it is
         x = torch.randn(1, 8, 16, 32, generator=torch.Generator().manual_seed(0))
         torch.testing.assert_close(down(x.flip(2, 3)), down(x).flip(2, 3))
 
