@@ -112,7 +112,8 @@ def consistent_poses(pairs: Mapping[tuple[int, int], tuple[SE2, float]]) -> list
 def robust_mean(poses: Sequence[SE2], weights: FloatArray) -> SE2:
     """The centre of Student's t distribution that fits some poses best, found by expectation maximisation.
 
-    A pose is a point in four dimensions: x, y, and where the heading points to, 10 m away.
+    A pose is a point in four dimensions: x, y, and where the heading points to, 10 m away. All four have one variance:
+    the paper has a covariance, but two to six points, one of which may be wrong, do not tell so much.
 
     Args:
         poses: K of them, in one frame.
@@ -120,14 +121,11 @@ def robust_mean(poses: Sequence[SE2], weights: FloatArray) -> SE2:
     """
     points = np.array([[p.x, p.y, _LEVER * np.cos(p.yaw), _LEVER * np.sin(p.yaw)] for p in poses])
     weights = weights / weights.sum() if weights.sum() > 0.0 else np.full(len(points), 1.0 / len(points))
-    centre = np.median(points, axis=0)
-    covariance = np.eye(4)
+    centre, variance = np.median(points, axis=0), 1.0
     for _ in range(_STEPS):
-        offsets = points - centre
-        distances = (offsets * np.linalg.solve(covariance, offsets.T).T).sum(axis=1)
-        scales = weights * (_DEGREES_OF_FREEDOM + 4.0) / (_DEGREES_OF_FREEDOM + distances)
+        squares = ((points - centre) ** 2).sum(axis=1)
+        scales = weights * (_DEGREES_OF_FREEDOM + 4.0) / (_DEGREES_OF_FREEDOM + squares / variance)
         centre = scales @ points / scales.sum()
-        offsets = points - centre
-        covariance = (scales[:, None] * offsets).T @ offsets + _LEAST_VARIANCE * np.eye(4)
+        variance = scales @ ((points - centre) ** 2).sum(axis=1) / 4.0 + _LEAST_VARIANCE
     x, y, cos, sin = centre
     return SE2(x, y, np.arctan2(sin, cos))
