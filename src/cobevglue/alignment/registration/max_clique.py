@@ -69,7 +69,7 @@ def _branch_and_bound(neighbours: list[int], best: list[int], max_steps: int) ->
     """The largest clique, if it takes no more steps; else the largest found."""
     everything = (1 << len(neighbours)) - 1
     # A branch: the clique so far, and what may be added to it, each with a bound on how much that can become.
-    stack = [([], everything, *_coloured(everything, neighbours))]
+    stack: list[tuple[list[int], int, list[int], list[int]]] = [([], everything, *_coloured(everything, neighbours))]
     for _ in range(max_steps):
         if not stack:
             break

@@ -10,7 +10,7 @@ import numpy as np
 
 from cobevglue.alignment.group import GroupAligner, Observation
 from cobevglue.messages import decode_arrays, encode_arrays
-from cobevglue.typing import FloatArray, IntArray
+from cobevglue.typing import Float32Array, FloatArray, IntArray
 
 __all__ = ["PointAligner", "height_above_ground", "one_per_voxel", "within_reach"]
 
@@ -83,9 +83,9 @@ class PointAligner(GroupAligner):
         return replace(super().decode(others, observation), points=points)
 
 
-def within_reach(points: FloatArray) -> FloatArray:
+def within_reach(points: Float32Array | FloatArray) -> FloatArray:
     """(N, 3) x, y, z of those points (…, at least 3) that are finite and near enough to be sent."""
-    xyz = np.asarray(points)[:, :3].astype(np.float64)
+    xyz = points[:, :3].astype(np.float64)
     return xyz[(np.abs(xyz) < _REACH).all(axis=1)]
 
 
@@ -111,7 +111,8 @@ def height_above_ground(points: FloatArray) -> FloatArray:
     x, y, z = points.T
     near = np.hypot(x, y) < _GROUND_RADIUS
     if near.sum() < _FEWEST_ON_GROUND:
-        return z - z.min(initial=0.0)
+        above_lowest: FloatArray = z - z.min(initial=np.inf)
+        return above_lowest
     level = np.floor(z[near] / _GROUND_BIN).astype(np.int64)
     values, counts = np.unique(level, return_counts=True)
     basis = np.column_stack([x, y, np.ones_like(x)])
