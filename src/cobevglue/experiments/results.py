@@ -175,7 +175,7 @@ def read_result(path: Path) -> ScenarioResult:
         ValueError: the file is damaged, or of something else; names it.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             document = json.loads(file["document"].tobytes())
             boxes, truth = file["boxes"].astype(np.float64), file["truth"]
         if document["format"] != _FORMAT:
