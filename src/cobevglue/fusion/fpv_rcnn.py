@@ -76,6 +76,10 @@ class FPVRCNN(SingleMapFusion):
         self.describe = nn.Linear(self.config.shrink_channels, _FEATURES)
         self.second_stage = RoIHead(_FEATURES, _MARGIN)
 
+    def turned_channels(self) -> Sequence[int]:
+        """None: boxes are what is told of directions here, and boxes are turned."""
+        return []
+
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
         """The ego's own map: the first stage is not fused."""
         return [maps[0][0]]

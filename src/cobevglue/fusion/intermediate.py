@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from cobevglue.boxes import Boxes
 from cobevglue.fusion.method import FusionMethod, Received
+from cobevglue.fusion.turn import Turn
 from cobevglue.fusion.warp import coverage, warp
 from cobevglue.messages import Arrays
 from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
@@ -79,8 +80,13 @@ class IntermediateFusion(FusionMethod, nn.Module):
         self.anchors = detector.anchors
         self.neck = copy.deepcopy(detector.neck)
         self.head = copy.deepcopy(detector.head)
+        self.turns = nn.ModuleList(Turn(channels) for channels in self.turned_channels())
         self.metadata: dict[str, Any] = {}
         self.encoder = fingerprint(detector)
+
+    @abstractmethod
+    def turned_channels(self) -> Sequence[int]:
+        """Channels of the shared maps that say something of directions, the first ones of `share`."""
 
     @abstractmethod
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
@@ -120,10 +126,28 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
         """Warp and fuse maps (n, C, H, W) of n agents, the ego first."""
-        others = ego_SE2_agent[1:]
-        warped = [torch.cat([m[:1], warp(m[1:], others, self.config)]) for m in maps]
-        covered = [torch.cat([torch.ones_like(m[:1, :1]), coverage(m[1:], others, self.config)]) for m in maps]
-        return self.fuse_maps(warped, covered)
+        placed = [self.placed(m[1:], ego_SE2_agent[1:], i) for i, m in enumerate(maps)]
+        return self.fuse_maps(
+            [torch.cat([m[:1], others]) for m, (others, _) in zip(maps, placed, strict=True)],
+            [torch.cat([torch.ones_like(m[:1, :1]), covered]) for m, (_, covered) in zip(maps, placed, strict=True)],
+        )
+
+    def placed(self, maps: Tensor, ego_SE2_others: Sequence[SE2], index: int) -> tuple[Tensor, Tensor]:
+        """Maps of other agents, warped to the ego's frame and turned to its directions.
+
+        Args:
+            maps: (B, C, H, W) of B agents, what each shared.
+            ego_SE2_others: B poses.
+            index: which of the shared maps it is.
+
+        Returns:
+            (B, C, H, W), and how much of each cell they cover, (B, 1, H, W).
+        """
+        warped = warp(maps, ego_SE2_others, self.config)
+        covered = coverage(maps, ego_SE2_others, self.config)
+        if index < len(self.turns):
+            warped = self.turns[index](warped, [pose.yaw for pose in ego_SE2_others], covered)
+        return warped, covered
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
         """What training minimises ("total"), and its parts for the log.
@@ -198,6 +222,10 @@ class IntermediateFusion(FusionMethod, nn.Module):
 class MultiScaleFusion(IntermediateFusion):
     """Shares the encoder's three maps as they are, fuses each, and decodes them as the detector does."""
 
+    def turned_channels(self) -> Sequence[int]:
+        """Of the three maps."""
+        return self.config.block_channels
+
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
         """The maps themselves."""
         return list(features)
@@ -210,6 +238,10 @@ class MultiScaleFusion(IntermediateFusion):
 
 class SingleMapFusion(IntermediateFusion):
     """Shares the one map at stride 2 that the neck makes of the three."""
+
+    def turned_channels(self) -> Sequence[int]:
+        """Of the one map."""
+        return [self.config.shrink_channels]
 
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
         """The neck's map."""

@@ -52,6 +52,10 @@ class V2VNet(SingleMapFusion):
             nn.ReLU(inplace=True),
         )
 
+    def turned_channels(self) -> Sequence[int]:
+        """Of the map at stride 4."""
+        return [2 * self.config.shrink_channels]
+
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
         """The neck's map, at half its resolution: stride 4."""
         return [self.down(self.neck(features))]

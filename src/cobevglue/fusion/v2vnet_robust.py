@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from cobevglue.fusion.intermediate import FusionSample
 from cobevglue.fusion.v2vnet import V2VNet
-from cobevglue.fusion.warp import coverage, warp
+from cobevglue.fusion.warp import coverage
 from cobevglue.perception import DetectionLoss, PointPillars, TargetBatch
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray
@@ -82,7 +82,7 @@ class V2VNetRobust(V2VNet):
         for (first, second), pose in believed.items():
             ego, other = maps[first : first + 1], maps[second : second + 1]
             for _ in range(iterations):
-                (steps,) = self._steps(ego, warp(other, [pose], self.config), [pose]).tolist()
+                (steps,) = self._steps(ego, self.placed(other, [pose], 0)[0], [pose]).tolist()
                 pose = apply_correction(pose, steps)
             found[first, second] = pose, float(coverage(other, [pose], self.config).mean())
         return found
@@ -106,17 +106,17 @@ class V2VNetRobust(V2VNet):
         true = sample.true_ego_SE2_agent[1:]
         # Taking turns by the sample's number too, a single collaborator is as often strong as weak.
         noisy = [true[i] if (number + i) % 2 else pose for i, pose in enumerate(sample.ego_SE2_agent[1:])]
-        moved = warp(others, noisy, self.config)
+        moved, _ = self.placed(others, noisy, 0)
         steps = self._steps(ego, moved, noisy)
         wanted = [true_correction(n, t) for n, t in zip(noisy, true, strict=True)]
         pose = F.smooth_l1_loss(steps, steps.new_tensor(np.reshape(wanted, (-1, 3))), reduction="sum")
 
         better = [apply_correction(n, step) for n, step in zip(noisy, steps.tolist(), strict=True)]
-        placed = torch.cat([ego, warp(others, better, self.config)])
-        covered = torch.cat([torch.ones_like(ego[:, :1]), coverage(others, better, self.config)])
-        logits = self._attend(ego, placed[1:])
+        placed, covered = self.placed(others, better, 0)
+        logits = self._attend(ego, placed)
         attention = _attention_loss(self._attend(ego, moved), noisy, true) + _attention_loss(logits, better, true)
-        return self._fuse_weighted(placed, covered, logits), pose, attention / 2.0
+        maps, covered = torch.cat([ego, placed]), torch.cat([torch.ones_like(ego[:, :1]), covered])
+        return self._fuse_weighted(maps, covered, logits), pose, attention / 2.0
 
     def _steps(self, first: Tensor, moved: Tensor, poses: Sequence[SE2]) -> Tensor:
         """(P, 3) corrections, as `apply_correction` takes them, of the poses by which P maps were moved."""

@@ -54,6 +54,10 @@ class V2XViT(IntermediateFusion):
         )
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    def turned_channels(self) -> Sequence[int]:
+        """Of the map at stride 4."""
+        return [2 * self.config.shrink_channels]
+
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
         """The neck's map at stride 4."""
         return [self.down(self.neck(features))]
