@@ -56,7 +56,7 @@ class MaximumConsensus(GroupAligner):
             raise ValueError(f"shift must be in [0, 50] m and turn in [0, pi] rad, got {shift} and {turn}")
         if not distance > 0.0:
             raise ValueError(f"distance must be > 0, got {distance}")
-        if min_consensus < 2:
+        if not min_consensus >= 2:
             raise ValueError(f"min_consensus must be >= 2, as fewer give no pose, got {min_consensus}")
         self.distance, self.min_consensus = distance, min_consensus
         steps = _STEP * np.arange(-int(shift / _STEP + 1e-9), int(shift / _STEP + 1e-9) + 1)

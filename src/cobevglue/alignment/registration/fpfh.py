@@ -52,7 +52,7 @@ class FPFHTeaser(PointAligner):
 
     def __init__(self, budget_bytes: int | None = None, min_inliers: int = 10) -> None:
         super().__init__(budget_bytes)
-        if min_inliers < 4:
+        if not min_inliers >= 4:
             raise ValueError(f"min_inliers must be >= 4, as fewer always agree, got {min_inliers}")
         self.min_inliers = min_inliers
 

@@ -22,7 +22,7 @@ _REACH = 300.0
 """… and so cannot be farther than 327 m."""
 _STREAM = 70
 
-_GROUND_RADIUS, _GROUND_BIN, _GROUND_TOLERANCES, _FEWEST_ON_GROUND = 40.0, 0.2, (0.5, 0.3, 0.2), 10
+_GROUND_RADIUS, _GROUND_BIN, _GROUND_TOLERANCES, _FEWEST_ON_GROUND = 40.0, 0.2, (1.0, 0.7, 0.5, 0.3, 0.2), 10
 
 
 class PointAligner(GroupAligner):
@@ -102,7 +102,7 @@ def one_per_voxel(points: FloatArray, size: float) -> IntArray:
 def height_above_ground(points: FloatArray) -> FloatArray:
     """(N,) heights above the ground [m], taken to be a plane.
 
-    The plane starts level at the height that most points within 40 m have and is fitted to the points near it, three
+    The plane starts level at the height that most points within 40 m have and is fitted to the points near it, five
     times; so it leans as the sensor does. A cloud without ground gives heights above whatever most of it lies on.
 
     Args:
