@@ -53,7 +53,8 @@ def scene(seed: int, objects: int = 25) -> FloatArray:
     solids = []
     for _ in range(objects):
         half = rng.uniform((0.3, 0.3, 0.5), (3.0, 1.2, 1.8))
-        place = SE2(*rng.uniform(-18.0, 18.0, 2), rng.uniform(-math.pi, math.pi))
+        x, y, yaw = rng.uniform((-18.0, -18.0, -math.pi), (18.0, 18.0, math.pi))
+        place = SE2(x, y, yaw)
         skin = rng.uniform(-1.0, 1.0, (600, 3))
         side = rng.integers(3, size=600)
         skin[np.arange(600), side] = np.sign(skin[np.arange(600), side])

@@ -60,7 +60,8 @@ def test_exact_boxes_give_the_pose_to_machine_precision(seed: int, n: int) -> No
     pair = pair_of_views(n, seed, only_ego=3, only_other=3, noise=EXACT)
     rng = np.random.default_rng([seed, 3, 0])
     world_SE2_ego = random_pose(rng, 300.0)
-    off = SE2(*rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.005, 0.005))
+    x, y, yaw = rng.uniform((-0.3, -0.3, -0.005), (0.3, 0.3, 0.005))
+    off = SE2(x, y, yaw)
     observations = {
         "ego": boxes_at(pair.ego, world_SE2_ego, rng.uniform(0.001, 0.15, (len(pair.ego), 3))),
         "other": boxes_at(

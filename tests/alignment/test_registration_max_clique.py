@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def graph(n: int, share: float, seed: int) -> BoolArray:
     return np.asarray(upper | upper.T)
 
 
-def is_clique(adjacent: BoolArray, vertices: list[int]) -> bool:
+def is_clique(adjacent: BoolArray, vertices: Sequence[int]) -> bool:
     return all(adjacent[i, j] for i, j in itertools.combinations(vertices, 2))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cobevglue import SE2
 from cobevglue.alignment import ALIGNERS, Observation, group_aligner
 from cobevglue.alignment.registration.points import PointAligner, height_above_ground, one_per_voxel, within_reach
-from cobevglue.typing import FloatArray
+from cobevglue.typing import Float32Array
 
 from .observations import cloud_of, pose_of, scene
 
@@ -26,9 +26,9 @@ def aligner(name: str, budget: int | None = None) -> PointAligner:
     return made
 
 
-def seen_by(name: str, cloud: FloatArray = CLOUD) -> Observation:
+def seen_by(name: str, cloud: Float32Array = CLOUD) -> Observation:
     """All that an agent knows, as far as this aligner may look at it."""
-    return aligner(name).look_at(Observation(points=cloud.astype(np.float32), pose=pose_of(SE2(3.0, 4.0, 0.5))))
+    return aligner(name).look_at(Observation(points=cloud, pose=pose_of(SE2(3.0, 4.0, 0.5))))
 
 
 def sent(name: str, budget: int | None, observation: Observation, frame: int = 0) -> dict[str, bytes]:
@@ -40,15 +40,15 @@ def sent(name: str, budget: int | None, observation: Observation, frame: int = 0
 def test_all_messages_together_fit_the_budget_and_use_it(name: str, budget: int) -> None:
     observation = seen_by(name)
     parts = sent(name, budget, observation)
-    size = sum(map(len, parts.values()))
+    size = sum(len(part) for part in parts.values())
     assert size <= budget
-    everything = sum(map(len, sent(name, None, observation).values()))
+    everything = sum(len(part) for part in sent(name, None, observation).values())
     assert size > min(budget, everything) - 6
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_message_of_nothing_fits_the_smallest_budget(name: str) -> None:
-    assert sum(map(len, sent(name, 256, seen_by(name, CLOUD[:0])).values())) <= 256
+    assert sum(len(part) for part in sent(name, 256, seen_by(name, CLOUD[:0])).values()) <= 256
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -67,7 +67,7 @@ def test_points_arrive_within_a_centimetre(name: str, budget: int | None) -> Non
     assert np.abs(arrived.points * 100.0 - np.round(arrived.points * 100.0)).max() < 0.01
     if budget is None:
         np.testing.assert_allclose(arrived.points, sketch, atol=0.00501)
-    assert arrived.boxes is arrived.variance is arrived.features is None
+    assert (arrived.boxes, arrived.variance, arrived.features) == (None, None, None)
     if name == "fpfh-teaser":
         assert arrived.pose is None
     else:
@@ -106,7 +106,7 @@ def test_the_sample_is_spread_evenly() -> None:
 def test_nobody_is_told_more_than_is_needed(name: str) -> None:
     everything = Observation(points=CLOUD, pose=np.eye(4), variance=np.ones((0, 3)))
     needed = aligner(name).look_at(everything)
-    assert needed.variance is needed.boxes is needed.features is None
+    assert (needed.variance, needed.boxes, needed.features) == (None, None, None)
     assert (needed.pose is None) == (name == "fpfh-teaser")
     assert set(sent(name, None, needed)) == {"points"} | ({"pose"} if "icp" in name else set())
 

@@ -212,8 +212,8 @@ def optimise(detections: Detections, landmark: IntArray, ego_SE2_agent: FloatArr
         if np.abs(step).max() < _STEP_TOLERANCE or damping > _MOST_DAMPING:
             break
     normal, free = jacobian.T @ jacobian, 3 * count - 3
-    inverse: FloatArray = np.linalg.inv(normal + np.diag(1e-12 * _scale(normal)))
-    return state[:count], inverse[:free, :free]
+    inverse = np.linalg.inv(normal + np.diag(1e-12 * _scale(normal)))
+    return state[:count], inverse[:free, :free].astype(np.float64)
 
 
 def _scale(normal: FloatArray) -> FloatArray:
