@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cobevglue import Boxes
@@ -134,6 +134,7 @@ def test_nothing_merges_to_nothing_and_scores_are_needed() -> None:
 numbers = st.floats(-1.0, 1.0)
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.lists(numbers, min_size=7, max_size=7), numbers, st.floats(-4.0, 4.0))
 def test_refinements_lead_to_the_box(change: list[float], x: float, yaw: float) -> None:
     proposal = cars((30 * x, 5.0, yaw, 0.7))
@@ -349,6 +350,22 @@ def test_the_loss_is_that_of_scores_and_boxes() -> None:
     assert exact["second_box"].item() < 0.05
     assert none["second_score"].item() == pytest.approx(-np.log1p(-scores).mean(), rel=0.05)
     assert none["second_box"].item() == 0.0
+
+
+def test_a_score_is_to_grow_from_0_at_a_quarter_to_1_at_three_quarters_of_overlap() -> None:
+    seen = checks.view(DETECTOR, 0)
+    method = method_with_weights()
+    scores = seen.detections.score
+    assert scores is not None
+    method.proposal_score = float(scores[:2].mean())  # one proposal
+    loss = DetectionLoss(method.config)
+    for overlap, wanted in ((0.2, 0.0), (0.4, 0.3), (0.7, 0.9), (0.9, 1.0)):
+        truth = seen.detections[:1].replace(score=None)
+        truth = truth.replace(size=truth.size / [overlap, 1.0, 1.0])
+        sample = replace(checks.sample_of([seen]), truth=truth)
+        with torch.no_grad():
+            found = method.loss([sample], targets_of(truth, method), loss)["second_score"].item()
+        assert found == pytest.approx(-wanted * np.log(scores[0]) - (1 - wanted) * np.log1p(-scores[0]), rel=0.05)
 
 
 def test_the_second_stage_needs_the_truth() -> None:
