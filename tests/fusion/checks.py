@@ -10,6 +10,7 @@ import torch
 
 from cobevglue import Boxes
 from cobevglue.fusion import FusionSample, IntermediateFusion, Received
+from cobevglue.fusion.turn import Turn
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.perception import (
     DetectionLoss,
@@ -94,6 +95,9 @@ def check_all_parameters_learn(method: IntermediateFusion, detector: PointPillar
         assert sample.truth is not None
         rows = np.column_stack([sample.truth.center, sample.truth.size, sample.truth.yaw])
         targets.append(assign_targets(rows, np.zeros(len(rows), dtype=bool), method.anchors))
+    for turn in method.turns:  # at first they add 0, so that only their last layer has a gradient
+        assert isinstance(turn, Turn)
+        torch.nn.init.normal_(turn.last.weight, std=0.1)
     method.train()
     terms = method.loss(samples, collate_targets(targets, len(method.anchors)), DetectionLoss(method.config))
     terms["total"].backward()  # type: ignore[no-untyped-call]

@@ -47,15 +47,23 @@ _RIGHT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Told:
-    """What one agent tells: boxes with scores, (K, 3) keypoints [m] in the same frame, (K, F) features."""
+    """What one agent tells: boxes with scores, (K, 3) keypoints [m] in the same frame, (K, F) features.
+
+    `heading` is the agent's own in that frame [rad]: features say directions in the agent's.
+    """
 
     proposals: Boxes
     keypoints: Float32Array
     features: Tensor
+    heading: float = 0.0
 
     def seen_from(self, ego_SE2_other: SE2) -> _Told:
-        moved = ego_SE2_other.apply(self.keypoints).astype(np.float32)
-        return replace(self, proposals=self.proposals.transform(ego_SE2_other), keypoints=moved)
+        return replace(
+            self,
+            proposals=self.proposals.transform(ego_SE2_other),
+            keypoints=ego_SE2_other.apply(self.keypoints).astype(np.float32),
+            heading=self.heading + ego_SE2_other.yaw,
+        )
 
 
 class FPVRCNN(SingleMapFusion):
@@ -77,7 +85,7 @@ class FPVRCNN(SingleMapFusion):
         self.second_stage = RoIHead(_FEATURES, _MARGIN)
 
     def turned_channels(self) -> Sequence[int]:
-        """None: boxes are what is told of directions here, and boxes are turned."""
+        """None: no maps are shared, and the second stage turns what keypoints say."""
         return []
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
@@ -167,7 +175,8 @@ class FPVRCNN(SingleMapFusion):
         proposals, count = merge_proposals(Boxes.concatenate([t.proposals for t in told]), _SAME_OBJECT)
         features = torch.cat([t.features for t in told])
         keypoints = np.concatenate([t.keypoints for t in told])
-        inputs = (features.new_tensor(v) for v in (_rows(proposals), proposals.score, count, keypoints))
+        headings = np.repeat([t.heading for t in told], [len(t.keypoints) for t in told])
+        inputs = (features.new_tensor(v) for v in (_rows(proposals), proposals.score, count, keypoints, headings))
         logits, refinement = self.second_stage(*inputs, features)
         return proposals, count, logits, refinement
 

@@ -12,6 +12,8 @@ __all__ = ["RoIHead"]
 _CHANNELS = 32
 _HIDDEN = 128
 _SCORE_LIMIT = 1e-4
+_HARMONICS = 2
+"""Sines and cosines of an angle, and of twice the angle, as in `Turn`."""
 
 
 class RoIHead(nn.Module):
@@ -20,6 +22,9 @@ class RoIHead(nn.Module):
     A proposal is cut into cells, in its own axes. What is said of a cell is the maximum over the keypoints in it of a
     small network that knows their features and where they are. PV-RCNN pools around each grid point within two radii,
     so that a keypoint is looked at many times; here it counts for its own cell, which is what a CPU has time for.
+
+    Features say directions in the frame of the agent that they are from, and a proposal is looked at in its own axes:
+    so the weights of the features are trigonometric polynomials of the angle between the two (ours, see `Turn`).
 
     Scores are told relative to those of the proposals, so that before training they are the same.
 
@@ -32,9 +37,9 @@ class RoIHead(nn.Module):
     def __init__(self, features: int, margin: float, grid: tuple[int, int, int] = (6, 4, 2)) -> None:
         super().__init__()
         self.margin, self.grid = margin, grid
-        self.point = nn.Sequential(
-            nn.Linear(features + 6, _CHANNELS), nn.ReLU(inplace=True), nn.Linear(_CHANNELS, _CHANNELS), nn.ReLU()
-        )
+        self.place = nn.Linear(6, _CHANNELS)
+        self.feature = nn.Linear(features, (1 + 2 * _HARMONICS) * _CHANNELS, bias=False)
+        self.point = nn.Sequential(nn.ReLU(inplace=True), nn.Linear(_CHANNELS, _CHANNELS), nn.ReLU(inplace=True))
         self.box = nn.Sequential(
             nn.Linear(math.prod(grid) * _CHANNELS + 5, _HIDDEN),
             nn.ReLU(inplace=True),
@@ -47,7 +52,7 @@ class RoIHead(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(
-        self, boxes: Tensor, score: Tensor, count: Tensor, keypoints: Tensor, features: Tensor
+        self, boxes: Tensor, score: Tensor, count: Tensor, keypoints: Tensor, headings: Tensor, features: Tensor
     ) -> tuple[Tensor, Tensor]:
         """What to make of R proposals.
 
@@ -56,6 +61,7 @@ class RoIHead(nn.Module):
             score: (R,) of the proposals, 0 to 1.
             count: (R,) how many proposals each is made of.
             keypoints: (K, 3) x, y, z [m] in the same frame, of all agents.
+            headings: (K,) of the agent that each is from [rad].
             features: (K, F) theirs.
 
         Returns:
@@ -63,11 +69,14 @@ class RoIHead(nn.Module):
         """
         prior = torch.logit(score, eps=_SCORE_LIMIT)
         known = torch.cat([boxes[:, 3:6].log(), prior[:, None], count[:, None].log()], dim=1)
-        x = self.box(torch.cat([self.pool(boxes, keypoints, features).flatten(1), known], dim=1))
+        x = self.box(torch.cat([self.pool(boxes, keypoints, headings, features).flatten(1), known], dim=1))
         return prior + self.logit(x)[:, 0], self.refinement(x)
 
-    def pool(self, boxes: Tensor, keypoints: Tensor, features: Tensor) -> Tensor:
-        """(R, cells, channels) what the keypoints say of every cell of every proposal; 0 where there are none."""
+    def pool(self, boxes: Tensor, keypoints: Tensor, headings: Tensor, features: Tensor) -> Tensor:
+        """(R, cells, channels) what the keypoints say of every cell of every proposal; 0 where there are none.
+
+        See `forward` for the arguments.
+        """
         offset = keypoints - boxes[:, None, :3]  # (R, K, 3)
         c, s = boxes[:, None, 6].cos(), boxes[:, None, 6].sin()
         x, y, z = offset.unbind(dim=-1)
@@ -81,7 +90,12 @@ class RoIHead(nn.Module):
         i, j, k = (share * grid).long().unbind(dim=-1)
         cells = math.prod(self.grid)
         cell = box * cells + (i * self.grid[1] + j) * self.grid[2] + k
-        said: Tensor = self.point(torch.cat([features[keypoint], local, share - 0.5], dim=1))
+        angle = boxes[box, 6] - headings[keypoint]
+        waves = [wave(n * angle) for n in range(1, 1 + _HARMONICS) for wave in (torch.cos, torch.sin)]
+        weight = torch.stack([torch.ones_like(angle), *waves], dim=1)
+        told = self.feature(features).unflatten(1, (-1, _CHANNELS))[keypoint]  # (pairs, waves, channels)
+        told = (weight[:, :, None] * told).sum(dim=1)
+        said: Tensor = self.point(told + self.place(torch.cat([local, share - 0.5], dim=1)))
         pooled = said.new_zeros(len(boxes) * cells, said.shape[1])
         pooled = pooled.scatter_reduce(0, cell[:, None].expand_as(said), said, "amax")
         return pooled.view(len(boxes), cells, _CHANNELS)
