@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from cobevglue.alignment import ALIGNERS, BEVGlueConfig, group_aligner
-from cobevglue.alignment.group import GroupAligner
+from cobevglue.alignment import ALIGNERS
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.disturbance import Disturbance, disturbance
 from cobevglue.settings import Settings
@@ -52,16 +51,6 @@ class Condition(Settings):
     def key(self) -> str:
         """All of it as one line of JSON."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
-
-    def make_aligner(self) -> GroupAligner:
-        """An aligner that has seen nothing yet.
-
-        Raises:
-            ValueError: it does not take these options.
-        """
-        if self.aligner == "bevglue":
-            return group_aligner("bevglue", config=BEVGlueConfig(**self.aligner_options))
-        return group_aligner(self.aligner, **self.aligner_options)
 
     def make_disturbance(self) -> Disturbance:
         """What goes wrong."""

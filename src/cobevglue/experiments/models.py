@@ -9,11 +9,17 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from cobevglue.alignment import BEVGlueConfig, group_aligner
+from cobevglue.alignment.group import GroupAligner
+from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.study import StudySettings
 from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion
 from cobevglue.perception import PointPillars
 
 __all__ = ["Models"]
+
+_WITH_NETWORK = {"v2vnet-robust"}
+"""Aligners that are half of the fusion method of the same name: they use its network."""
 
 
 class Models:
@@ -36,6 +42,7 @@ class Models:
         detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
         self.detector = detector.to("cuda" if torch.cuda.is_available() else "cpu")
         self._methods: dict[str, FusionMethod] = {}
+        self._fingerprints: dict[str, str] = {}
 
     @property
     def evaluation_range(self) -> tuple[float, float, float, float]:
@@ -73,10 +80,30 @@ class Models:
             method.load(Path(settings.weights) / f"{name}.safetensors")
         return method
 
-    def fingerprint(self, name: str) -> str:
-        """Of a method's weights: changes when they do, and with them what it gives."""
-        method = self.method(name)
-        return _fingerprint(method if isinstance(method, nn.Module) else self.detector)
+    def aligner(self, condition: Condition) -> GroupAligner:
+        """The aligner of a condition, which has seen nothing yet; one with a network gets that of this study.
+
+        Raises:
+            ValueError: it does not take the condition's options.
+            ModuleNotFoundError: what it needs is not installed.
+        """
+        if condition.aligner in _WITH_NETWORK:
+            network = self.method(condition.aligner)
+            return group_aligner(condition.aligner, fusion=network, **condition.aligner_options)
+        if condition.aligner == "bevglue":
+            return group_aligner("bevglue", config=BEVGlueConfig(**condition.aligner_options))
+        return group_aligner(condition.aligner, **condition.aligner_options)
+
+    def fingerprint(self, condition: Condition) -> str:
+        """Of the weights that a condition is run with: changes when they do, and with them what comes out."""
+        names = [condition.fusion, *({condition.aligner} & _WITH_NETWORK - {condition.fusion})]
+        return "-".join(self._fingerprint_of(name) for name in names)
+
+    def _fingerprint_of(self, name: str) -> str:
+        if name not in self._fingerprints:
+            method = self.method(name)
+            self._fingerprints[name] = _fingerprint(method if isinstance(method, nn.Module) else self.detector)
+        return self._fingerprints[name]
 
     @property
     def detector_fingerprint(self) -> str:

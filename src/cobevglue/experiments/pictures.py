@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from itertools import islice
 
-from cobevglue.alignment import Alignment
+import numpy as np
+
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.disturbance import Moment
 from cobevglue.evaluation.detection_matching import inside
+from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.drive import Drive
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.study import StudySettings, drive_frames, drive_names, open_drive
 from cobevglue.experiments.tables.noise import noise_curves
 from cobevglue.experiments.tables.registration import registration_points
-from cobevglue.experiments.tables.scope import Scope, as_is, method_title
+from cobevglue.experiments.tables.scope import Scope, aligner_title, as_is, method_title, needs
 from cobevglue.fusion import FUSION_METHODS
 from cobevglue.se2 import SE2
 from cobevglue.system import CoBEVGlue, StepOutput
@@ -56,60 +60,93 @@ def registration_pictures(scope: Scope, results: Results) -> list[Picture]:
     return [(title, ap_over_bytes(registration_points(scope, results, 0.5), title))]
 
 
-def scene_pictures(settings: StudySettings, models: Models) -> list[Picture]:
-    """One frame of the first drive: what methods detect under noise, and what BEVGlue matches.
+def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> list[Picture]:
+    """One frame of the first drive in which the ego has company: the paper's Figures 5 and 6.
 
-    Nothing where the ego has no company there.
+    What methods detect under noise; and where registration of points and BEVGlue put what collaborators saw.
     """
     from cobevglue.visualization.study_figures import detections_picture, matching_picture
 
-    drive = Drive(models.detector)
-    for number in range(len(drive_names(settings))):
-        drive = Drive(models.detector)
-        drive.see(islice(drive_frames(settings, open_drive(settings, number)), _FRAMES))
-        if drive.moments and drive.moments[-1].collaborators(drive.ego):
-            break
-    else:
+    drive = _drive_in_company(settings, models)
+    if drive is None:
         return []
-    ego, truth = drive.ego, drive.truth[-1].objects
-    counts = inside(truth, models.evaluation_range) & (drive.truth[-1].point_count >= settings.min_points)
+    ego, moment, truth = drive.ego, drive.moments[-1], drive.truth[-1]
+    counted = inside(truth.objects, models.evaluation_range) & (truth.point_count >= settings.min_points)
+    objects = truth.objects[counted]
+    (ours,) = scope.localised
     pictures = []
     for name in _SHOWN:
         if name in FUSION_METHODS:
-            moment, out = _run(name, drive, models, settings.seed)
-            clouds = _clouds(moment, ego)
+            out = _run(as_is(name, _NOISE), drive, models, settings.seed)
             title = f"{method_title(name)}, noise {_NOISE:g} m, {_NOISE:g}°"
             caption = f"{title}: true boxes in green, detections of score {_SCORE:g} and more in red."
-            pictures.append((caption, detections_picture(clouds, truth[counts], _sure(out.boxes), title)))
-    moment, out = _run("cobevglue", drive, models, settings.seed)
+            clouds = _clouds(moment, ego, _true_poses(moment, ego))
+            pictures.append((caption, detections_picture(clouds, objects, _sure(out.boxes), title)))
+    for aligner in scope.registrations:
+        if not needs(aligner, "pose"):
+            condition = as_is(ours, 0.0, aligner, aligner_options={"budget_bytes": scope.budgets[-1]})
+            out = _run(condition, drive, models, settings.seed, last_only=True)
+            title = f"{aligner_title(aligner)} on {scope.budgets[-1]:,} bytes of points"
+            caption = f"{title}: all clouds where it puts them, true boxes in green. {_errors(moment, ego, out)}."
+            clouds = _clouds(moment, ego, {name: one.ego_SE2_other for name, one in out.alignments.items()})
+            pictures.append((caption, detections_picture(clouds, objects, Boxes.empty(), title)))
+    out = _run(as_is(ours), drive, models, settings.seed)
     for other, alignment in out.alignments.items():
-        caption = f"What BEVGlue matches of {ego} and {other}: {_matched(alignment)}."
+        sent = out.alignment_bytes[other]
+        caption = f"BEVGlue on {sent:,} bytes of boxes, those that match joined. {_errors(moment, ego, out, other)}."
         pictures.append((caption, matching_picture(moment.seen[ego].boxes, moment.seen[other].boxes, alignment)))
     return pictures
 
 
-def _run(name: str, drive: Drive, models: Models, seed: int) -> tuple[Moment, StepOutput]:
-    """The last frame under noise; who remembers has seen those before."""
-    condition = as_is(name, _NOISE)
-    system = CoBEVGlue(models.detector, models.method(name), condition.make_aligner())
-    noise = condition.make_disturbance()
-    moments = [noise.apply(drive.moments, index, drive.ego, (seed, 0)) for index in range(len(drive.moments))]
-    outs = [system.collaborate(moment.seen, drive.ego, moment.time, moment.claimed) for moment in moments]
-    return moments[-1], outs[-1]
+def _drive_in_company(settings: StudySettings, models: Models) -> Drive | None:
+    """The first drive at whose last shown frame there are others, gone through up to there."""
+    for number in range(len(drive_names(settings))):
+        drive = Drive(models.detector)
+        drive.see(islice(drive_frames(settings, open_drive(settings, number)), _FRAMES))
+        if drive.moments and drive.moments[-1].collaborators(drive.ego):
+            return drive
+    return None
 
 
-def _clouds(moment: Moment, ego: str) -> list[FloatArray]:
-    """Everyone's points in the ego's frame, by the true poses."""
-    clouds = []
-    for agent, view in moment.seen.items():
-        ego_SE2_agent = SE2.from_matrix(inverse_SE3(moment.true[ego]) @ moment.true[agent])
-        clouds.append(ego_SE2_agent.apply(view.points[:, :3]))
+def _run(condition: Condition, drive: Drive, models: Models, seed: int, last_only: bool = False) -> StepOutput:
+    """What the ego concludes in the last frame; who remembers has seen those before."""
+    system = CoBEVGlue(models.detector, models.method(condition.fusion), models.aligner(condition))
+    disturbance = condition.make_disturbance()
+    last = len(drive.moments) - 1
+    for index in range(last if last_only else 0, last + 1):
+        moment = disturbance.apply(drive.moments, index, drive.ego, (seed, 0))
+        out = system.collaborate(moment.seen, drive.ego, moment.time, moment.claimed)
+    return out
+
+
+def _true_poses(moment: Moment, ego: str) -> dict[str, SE2]:
+    """Of all collaborators in the ego's frame."""
+    ego_SE3_world = inverse_SE3(moment.true[ego])
+    return {other: SE2.from_matrix(ego_SE3_world @ moment.true[other]) for other in moment.collaborators(ego)}
+
+
+def _clouds(moment: Moment, ego: str, poses: Mapping[str, SE2 | None]) -> list[FloatArray]:
+    """The ego's points, and those of the others by these poses; without a pose they are left out."""
+    clouds = [moment.seen[ego].points[:, :3].astype(np.float64)]
+    for other, ego_SE2_other in poses.items():
+        if ego_SE2_other is not None:
+            clouds.append(ego_SE2_other.apply(moment.seen[other].points[:, :3]))
     return clouds
+
+
+def _errors(moment: Moment, ego: str, out: StepOutput, only: str = "") -> str:
+    """How far off the poses are."""
+    parts = []
+    for other, truth in _true_poses(moment, ego).items():
+        if only in ("", other):
+            pose = out.alignments[other].ego_SE2_other
+            if pose is None:
+                parts.append(f"{other}: refused, {out.alignments[other].reason}")
+            else:
+                shift, turn = pose.error_to(truth)
+                parts.append(f"{other}: off by {shift:.2f} m, {math.degrees(turn):.2f}°")
+    return "; ".join(parts)
 
 
 def _sure(boxes: Boxes) -> Boxes:
     return boxes if boxes.score is None else boxes[boxes.score >= _SCORE]
-
-
-def _matched(alignment: Alignment) -> str:
-    return f"{len(alignment.matches)} objects" if alignment.accepted else f"refused, {alignment.reason}"

@@ -74,7 +74,7 @@ def _pictures(
 ) -> dict[str, list[Picture]]:
     """Figures by the name of the experiment."""
     names = {experiment.name for experiment in experiments}
-    pictures = {"": scene_pictures(settings, models)}
+    pictures = {"": scene_pictures(settings, models, scope)}
     if "noise" in names:
         pictures["noise"] = noise_pictures(scope, results)
     if "registration" in names:

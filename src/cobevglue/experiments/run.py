@@ -81,7 +81,7 @@ def run_drive(
         seeing.truth,
         dict(seeing.left_out),
         {
-            run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition.fusion), run.frames)
+            run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition), run.frames)
             for run in runs
         },
     )
@@ -94,7 +94,7 @@ class _Run:
         self.condition = condition
         self.frames: dict[int, FrameResult] = {}
         self._memo = memo
-        self._system = CoBEVGlue(models.detector, memo, condition.make_aligner())
+        self._system = CoBEVGlue(models.detector, memo, models.aligner(condition))
         self._disturbance: Disturbance = condition.make_disturbance()
         self._key = key
 

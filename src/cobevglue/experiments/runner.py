@@ -73,8 +73,8 @@ def run_study(
     models = Models(settings)
     unique = list({condition.key: condition for condition in conditions}.values())
     for condition in unique:
-        condition.make_aligner()
-    fingerprints = {condition.key: models.fingerprint(condition.fusion) for condition in unique}
+        models.aligner(condition)
+    fingerprints = {condition.key: models.fingerprint(condition) for condition in unique}
     _claim(Path(folder), settings, models.detector_fingerprint)
 
     paths = [Path(folder) / f"{number:04d}_{_file_name(name)}.npz" for number, name in enumerate(names)]
@@ -164,6 +164,7 @@ def _run_in_processes(jobs: Sequence[_Job], workers: int, models: Models, progre
                 progress(done, total)
                 for future in finished:
                     yield pending.pop(future), future.result()
+            progress(total, total)
         finally:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)

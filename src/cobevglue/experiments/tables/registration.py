@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from cobevglue.alignment import ALIGNERS
-from cobevglue.alignment.group import GroupAligner
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results, pose_quality
 from cobevglue.experiments.table import Cell, Table
-from cobevglue.experiments.tables.scope import Experiment, Scope, aligner_title, as_is, method_title
+from cobevglue.experiments.tables.scope import Experiment, Scope, aligner_title, as_is, method_title, needs
 
 __all__ = ["REGISTRATION", "registration_points"]
 
 
 def _levels(scope: Scope, aligner: str) -> list[float | None]:
     """Of the initial pose; None for what needs none."""
-    kind = ALIGNERS[aligner]
-    needs_pose = issubclass(kind, GroupAligner) and "pose" in kind.needs
-    return [*scope.registration_levels] if needs_pose else [None]
+    return [*scope.registration_levels] if needs(aligner, "pose") else [None]
 
 
 def _rows(scope: Scope) -> dict[tuple[str, str], Condition]:

@@ -7,13 +7,24 @@ from dataclasses import dataclass
 from typing import Any
 
 from cobevglue.alignment import ALIGNERS
-from cobevglue.alignment.group import GroupAligner
+from cobevglue.alignment.group import GroupAligner, Need
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.table import Table
 from cobevglue.fusion import FUSION_METHODS
 
-__all__ = ["FULL", "QUICK", "Experiment", "Scope", "aligner_title", "as_is", "attacked", "level_name", "method_title"]
+__all__ = [
+    "FULL",
+    "QUICK",
+    "Experiment",
+    "Scope",
+    "aligner_title",
+    "as_is",
+    "attacked",
+    "level_name",
+    "method_title",
+    "needs",
+]
 
 _METHOD_TITLES = {
     "none": "No collaboration",
@@ -78,8 +89,7 @@ class Scope:
     @property
     def registrations(self) -> list[str]:
         """The aligners that look at points."""
-        kinds = {name: kind for name, kind in ALIGNERS.items() if issubclass(kind, GroupAligner)}
-        return [name for name, kind in kinds.items() if "points" in kind.needs]
+        return [name for name in ALIGNERS if needs(name, "points")]
 
 
 FULL = Scope()
@@ -118,6 +128,12 @@ def as_is(fusion: str, level: float = 0.0, aligner: str | None = None, **more: A
 def attacked(fusion: str, aligner: str | None = None) -> Condition:
     """A method with the aligner of its paper, or another one, under the attack of the paper."""
     return as_is(fusion, 0.0, aligner, disturbance="same-place")
+
+
+def needs(aligner: str, what: Need) -> bool:
+    """Whether a source of poses looks at such things."""
+    kind = ALIGNERS[aligner]
+    return what in kind.needs if issubclass(kind, GroupAligner) else what == "boxes"
 
 
 def level_name(level: float) -> str:
