@@ -2,7 +2,8 @@
 
     python tools/pack_fusion.py compact runs/fusion
 
-takes `runs/fusion/METHOD/last.safetensors` of every method that learns; those without a run keep what they have.
+takes `runs/fusion/METHOD/last.safetensors` of every method that learns; those without a finished run keep what they
+have.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def main() -> None:
             continue
         file = WEIGHTS / f"{arguments.detector}_{name}.safetensors"
         run = arguments.runs / name / "last.safetensors"
-        if run.is_file():
-            method(detector).load(run).save(file, half=True)
+        if run.is_file() and (trained := method(detector).load(run)).metadata["metrics"]:  # it was finished
+            trained.save(file, half=True)
         if file.is_file():
             rows.append(_row(name, method(detector).load(file), file))
             print(rows[-1])
