@@ -33,6 +33,9 @@ __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_f
 TEACHER = "disconet-teacher"
 """In the place of a method's name: what DiscoNet learns from."""
 
+_NORM_MOMENTUM = 0.1
+"""Of the norms' running statistics: a hundredth, as the detector has it, would still remember the start after a run."""
+
 _SAMPLE_STREAM = 90
 _STATE, _LAST = "state.pt", "last.safetensors"
 
@@ -294,6 +297,9 @@ def _make_model(config: TrainFusionConfig, detector: PointPillars) -> Intermedia
         model = made(detector)
     if isinstance(model, DiscoNet) and config.teacher is not None:
         model.teacher = EarlyTeacher(detector).load(config.teacher)
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.momentum = _NORM_MOMENTUM
     return model
 
 
