@@ -14,7 +14,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -32,6 +32,9 @@ from cobevglue.perception.decode import decode
 from cobevglue.perception.head import HeadOutput
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["FusionSample", "IntermediateFusion", "MultiScaleFusion", "SingleMapFusion"]
 
