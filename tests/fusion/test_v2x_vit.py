@@ -131,7 +131,18 @@ def test_asking_for_the_ego_alone_gives_the_same() -> None:
 def method_with_weights(seed: int = 1) -> V2XViT:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return V2XViT(DETECTOR).eval()
+        method = V2XViT(DETECTOR).eval()
+        nn.init.normal_(method.up.weight, std=0.5)
+    return method
+
+
+def test_before_training_it_is_the_detector() -> None:
+    seen = checks.view(DETECTOR, 0)
+    with torch.inference_mode():
+        output = V2XViT(DETECTOR).eval()([checks.sample_of([seen])])
+        expected = DETECTOR.decode_features([m[None] for m in seen.features])
+    assert expected.logits.std() > 0.2
+    torch.testing.assert_close(output.logits, expected.logits, atol=0.02, rtol=0.0)
 
 
 def test_a_message_is_a_quarter_of_the_cells_with_twice_the_channels() -> None:
@@ -161,12 +172,13 @@ def test_messages_say_what_training_sees() -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = method_with_weights()
     with torch.inference_mode():
-        output = method([checks.sample_of([ego, other])])
-        received = checks.sent(method, other, checks.POSES[0])
+        seen = method.fused([checks.sample_of([ego, other])])
+        received = method.received_maps(checks.sent(method, other, checks.POSES[0]).content)
         own = method.share([m[None] for m in ego.features])
-        maps = [torch.cat([own[0], method.received_maps(received.content)[0][None]])]
-        over_the_wire = method.decode_maps([m[None] for m in method._fuse(maps, [SE2(), checks.POSES[0]])])
-    torch.testing.assert_close(over_the_wire.logits, output.logits, atol=0.01, rtol=0.0)
+        maps = [torch.cat([mine, theirs[None]]) for mine, theirs in zip(own, received, strict=True)]
+        over_the_wire = method._fuse(maps, [SE2(), checks.POSES[0]])
+    for there, here in zip(over_the_wire, seen, strict=True):
+        torch.testing.assert_close(there, here[0], atol=0.01, rtol=0.0)
 
 
 def test_it_listens_in_any_order() -> None:
