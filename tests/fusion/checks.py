@@ -22,6 +22,7 @@ from cobevglue.perception import (
     collate_targets,
 )
 from cobevglue.se2 import SE2
+from cobevglue.typing import Float32Array
 
 SMALL = PointPillarsConfig(
     x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 12),
@@ -33,20 +34,31 @@ POSES = SE2(3.0, 1.0, 0.2), SE2(-4.0, -1.5, 2.5)
 
 
 def small_detector(seed: int = 0) -> PointPillars:
-    """With random weights whose scores differ from place to place."""
-    with torch.random.fork_rng(devices=[]):
+    """With random weights whose features and scores differ from place to place."""
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
-        detector = PointPillars(SMALL).eval()
+        detector = PointPillars(SMALL)
         torch.nn.init.normal_(detector.head.logits.weight, std=0.5)
+    norms = [m for m in detector.modules() if isinstance(m, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d)]
+    for norm in norms:
+        norm.momentum = 1.0
+    with torch.no_grad():
+        detector.train()([torch.from_numpy(cloud(seed)) for seed in range(4)])
+    for norm in norms:
+        norm.momentum = 0.01
     detector.detection = detector.detection.model_copy(update={"score_threshold": 0.0, "max_detections": 20})
-    return detector
+    return detector.eval()
+
+
+def cloud(seed: int, count: int = 600) -> Float32Array:
+    """(N, 4) points everywhere."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform([-12, -6, -2, 0], [12, 6, 0, 1], (count, 4)).astype(np.float32)
 
 
 def view(detector: PointPillars, seed: int, count: int = 600) -> PerceptionOutput:
     """What an agent sees of random points."""
-    rng = np.random.default_rng(seed)
-    cloud = rng.uniform([-12, -6, -2, 0], [12, 6, 0, 1], (count, 4)).astype(np.float32)
-    return Perception(detector).step(cloud)
+    return Perception(detector).step(cloud(seed, count))
 
 
 def sample_of(seen: Sequence[PerceptionOutput], poses: Sequence[SE2] = POSES) -> FusionSample:
