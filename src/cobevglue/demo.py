@@ -22,9 +22,7 @@ from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.disturbance import Disturbance, LocalisationNoise, Moment, SamePlace, Undisturbed
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.evaluation.detection_matching import DROPPED, FALSE, EvaluationRange, inside, match, prepare
-from cobevglue.fusion.cobevglue import MaxFusion
 from cobevglue.fusion.none import NoCollaboration
-from cobevglue.perception import PointPillars
 from cobevglue.se2 import SE2
 from cobevglue.simulation.road_network import RoadNetwork
 from cobevglue.simulation.scenario import ScenarioSettings, SimulatedScenario
@@ -275,15 +273,10 @@ def run_demo(seed: int = 0, *, frames: int = FRAMES, progress: Callable[[int], N
 
 def _systems() -> dict[str, CoBEVGlue]:
     """A system for each row, all with the same detector and, but for ego only, the same fusion."""
-    whole = _system()
+    whole = CoBEVGlue.pretrained(WEIGHTS, fusion="cobevglue", aligner="bevglue")
     given = {row: CoBEVGlue(whole.detector, whole.fusion, group_aligner("given")) for row in ROWS}
     alone = CoBEVGlue(whole.detector, NoCollaboration(whole.detector), group_aligner("given"))
     return {**given, EGO_ONLY: alone, COBEVGLUE: whole}
-
-
-def _system() -> CoBEVGlue:
-    detector = PointPillars.pretrained(WEIGHTS)
-    return CoBEVGlue(detector, MaxFusion(detector).eval(), group_aligner("bevglue"))
 
 
 def _choose_ego(scenario: SimulatedScenario, reach: EvaluationRange) -> str:

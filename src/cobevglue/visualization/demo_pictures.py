@@ -22,7 +22,6 @@ from cobevglue.visualization.style import (
     add_axes,
     legend_below,
     new_figure,
-    set_title,
     style_bev,
 )
 
@@ -47,7 +46,7 @@ def draw_comparison(
     figure = new_figure(14.0, 4.75 * lines + 0.5)
     for axes, row in zip(add_axes(figure, lines, 2), rows, strict=False):
         draw_moment(axes, result.story(), row, result.roads)
-    legend_below(figure, columns=7)
+    legend_below(figure, columns=4)
     return figure
 
 
@@ -67,9 +66,8 @@ def draw_moment(axes: Axes, frame: DemoFrame, row: str, roads: RoadNetwork) -> N
     draw_boxes(axes, truth[missed], "black", label="missed", filled=False, linewidth=1.0, linestyle=":")
     draw_boxes(axes, truth[verdict.found & ~frame.hidden], EGO, label="found", linewidth=1.2)
     draw_boxes(axes, truth[verdict.found & frame.hidden], MATCH, label="found, hidden from the ego", linewidth=2.2)
-    draw_boxes(
-        axes, verdict.boxes[verdict.ghost], _GHOST, label="ghost: a box without a vehicle", linewidth=1.8, zorder=3.5
-    )
+    ghosts = verdict.boxes[verdict.ghost]
+    draw_boxes(axes, ghosts, _GHOST, label="ghost: a box without a vehicle", linewidth=1.8, zorder=3.5)
     at = truth.center[frame.hidden]
     axes.scatter(
         at[:, 0], at[:, 1], s=420.0, facecolors="none", edgecolors=_HIDDEN, linewidths=1.5, label="hidden from the ego"
@@ -77,12 +75,10 @@ def draw_moment(axes: Axes, frame: DemoFrame, row: str, roads: RoadNetwork) -> N
     draw_agent(axes, EGO, label="the ego")
     for pose in frame.used_poses(row).values():
         draw_agent(axes, OTHER, x=pose.x, y=pose.y, yaw=pose.yaw)
-    axes.scatter(
-        [], [], s=120.0, marker=">", color=OTHER, edgecolors="black", label="another car, where the ego has it"
-    )
-    style_bev(axes, "")
-    counted = f"{verdict.found.sum()} of {frame.counted.sum()} found, {verdict.ghost.sum()} ghosts"
-    set_title(axes, f"{ROWS[row][0].upper()}{ROWS[row][1:]}: {counted}")
+    # A stand-in for the legend, which is in all plots, also where there are no others.
+    axes.scatter([], [], s=120.0, marker=">", color=OTHER, edgecolors="black", label="another car, as it is placed")
+    result = f"{verdict.found.sum()} of {frame.counted.sum()} found, {len(ghosts)} ghost{'s' * (len(ghosts) != 1)}"
+    style_bev(axes, f"{ROWS[row][0].upper()}{ROWS[row][1:]}: {result}")
     x_min, x_max, y_min, y_max = _VIEW
     axes.set_xlim(x_min, x_max)
     axes.set_ylim(y_min, y_max)
