@@ -36,7 +36,8 @@ def centre_of(image: torch.Tensor, config: PointPillarsConfig, stride: int) -> n
     """Where the weight of an image lies [m]."""
     x, y = cell_centres(config, stride)
     weight = image[0, 0].numpy()
-    return np.array([(weight * x[None, :]).sum(), (weight * y[:, None]).sum()]) / weight.sum()
+    centre: np.ndarray = np.array([(weight * x[None, :]).sum(), (weight * y[:, None]).sum()]) / weight.sum()
+    return centre
 
 
 @pytest.mark.parametrize("config", [COMPACT, OFF_CENTRE], ids=["around the agent", "off centre"])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from cobevglue.fusion import IntermediateFusion, fusion_class
+from cobevglue.fusion.cobevglue import MaxFusion
+from cobevglue.fusion.f_cooper import FCooper
 from cobevglue.perception import PointPillars, PointPillarsConfig
 from cobevglue.training import FUSION_PRESETS, FeatureConfig, TrainFusionConfig, load_fusion_config, train_fusion
 from cobevglue.training.fusion_features import FusionFrames, write_features
@@ -106,15 +107,13 @@ def test_training_learns_and_leaves_the_encoder_alone(detector_file: Path, featu
     totals = [line["classification"] for line in lines if line["group"] == "train"]
     assert totals[-1] < 0.8 * totals[0]
     detector = PointPillars.load(detector_file)
-    trained = fusion_class("cobevglue")(detector)
-    assert isinstance(trained, IntermediateFusion)
-    trained.load(tmp_path / "last.safetensors")
+    trained = MaxFusion(detector).load(tmp_path / "last.safetensors")
     assert trained.metadata["training"]["method"] == "cobevglue"
     assert not torch.equal(trained.head.logits.weight, detector.head.logits.weight)
     with pytest.raises(ValueError, match="another detector"):
-        fusion_class("cobevglue")(PointPillars(SMALL)).load(tmp_path / "last.safetensors")  # type: ignore[attr-defined]
+        MaxFusion(PointPillars(SMALL)).load(tmp_path / "last.safetensors")
     with pytest.raises(ValueError, match="fusion MaxFusion"):
-        fusion_class("f-cooper")(detector).load(tmp_path / "last.safetensors")  # type: ignore[attr-defined]
+        FCooper(detector).load(tmp_path / "last.safetensors")
 
 
 def test_a_resumed_run_ends_where_the_uninterrupted_one_does(
@@ -134,9 +133,7 @@ def test_a_resumed_run_ends_where_the_uninterrupted_one_does(
         train_fusion(settings, tmp_path / "parts", report=stop_in_second_epoch)
     train_fusion(settings, tmp_path / "parts", resume=True, report=silent)
     detector = PointPillars.load(detector_file)
-    whole, parts = (
-        fusion_class("cobevglue")(detector).load(tmp_path / n / "last.safetensors") for n in ("whole", "parts")
-    )  # type: ignore[attr-defined]
+    whole, parts = (MaxFusion(detector).load(tmp_path / run / "last.safetensors") for run in ("whole", "parts"))
     for name, value in whole.state_dict().items():
         assert torch.equal(value, parts.state_dict()[name]), name
 

@@ -74,7 +74,7 @@ def pretrained_fusion(name: str, detector: PointPillars, detector_name: str) -> 
     Raises:
         ValueError: there is no such method; or there are no weights of it for this detector.
     """
-    method = fusion_class(name)(detector)  # type: ignore[call-arg]
+    method = fusion_class(name)(detector)
     if isinstance(method, IntermediateFusion):
         path = _WEIGHTS / f"{detector_name}_{name}.safetensors"
         if not path.is_file():

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from cobevglue.boxes import Boxes
 from cobevglue.messages import Arrays
-from cobevglue.perception import PerceptionOutput
+from cobevglue.perception import PerceptionOutput, PointPillars
 from cobevglue.se2 import SE2
 
 __all__ = ["FusionMethod", "Received"]
@@ -42,6 +42,10 @@ class FusionMethod(ABC):
 
     kind: ClassVar[Literal["features", "boxes", "points"]] = "features"
     usual_aligner: ClassVar[str] = "given"
+
+    @abstractmethod
+    def __init__(self, detector: PointPillars) -> None:
+        """Make the method for what this detector sees; the detector is not changed."""
 
     @abstractmethod
     def message(self, seen: PerceptionOutput) -> Arrays:
