@@ -197,7 +197,7 @@ def test_the_report_is_written(tiny: Path, tmp_path: Path) -> None:
     assert "### AP@0.5 under localisation noise, v2xset test" in markdown
     page = (tmp_path / "report" / "index.html").read_text()
     assert page.count("data:image/png;base64,") >= 4
-    rows = list(csv.reader((tmp_path / "report" / "opv2v_test" / "noise_ap0.7.csv").open()))
+    rows = list(csv.reader((tmp_path / "report" / "opv2v_test" / "noise_ap0.7.csv").read_text().splitlines()))
     assert rows[0][:3] == ["method", "poses from", "0.0/0.0"]
     assert len(rows) == 1 + len(FUSION_METHODS) + 2
 

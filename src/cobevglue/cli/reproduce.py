@@ -8,6 +8,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,6 +47,9 @@ def reproduce(
             "time."
         ),
     ] = None,
+    methods: Annotated[
+        str | None, typer.Option(help="Only these fusion methods, with commas, beside none and cobevglue.")
+    ] = None,
     scenarios: Annotated[
         int | None, typer.Option(min=1, help="So many drives at most; 20 of simulated ones if left out.")
     ] = None,
@@ -82,6 +86,7 @@ def reproduce(
         from cobevglue.experiments.reproduce import reproduce as run
         from cobevglue.experiments.study import SEED, StudySettings
         from cobevglue.experiments.tables import EXPERIMENTS, FULL, QUICK, experiments_named
+        from cobevglue.fusion import fusion_class
     except ImportError as error:
         raise InputError(" ".join(str(error).split())) from error
     names = list(EXPERIMENTS) if tables is None else [name.strip() for name in tables.split(",")]
@@ -101,10 +106,13 @@ def reproduce(
         )
     try:
         with expected_errors(), _progress_bar() as progress:
+            only = None if methods is None else [name.strip() for name in methods.split(",")]
+            for name in only or ():
+                fusion_class(name)
             made = run(
                 studies,
                 experiments_named(names),
-                QUICK if quick else FULL,
+                replace(QUICK if quick else FULL, only=only),
                 out,
                 _about(context, studies),
                 workers=workers or os.cpu_count() or 1,
@@ -155,13 +163,13 @@ def _about(context: typer.Context, studies: Sequence[StudySettings]) -> list[str
 
 def _command(context: typer.Context) -> str:
     """What the user typed, option by option."""
-    words = [context.command_path]
+    words = []
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if source is not None and source.name == "COMMANDLINE":
             value = context.params[parameter.name or ""]
             words += [parameter.opts[0]] if value is True else [parameter.opts[0], str(value)]
-    return shlex.join(words)
+    return f"{context.command_path} {shlex.join(words)}"
 
 
 @contextmanager

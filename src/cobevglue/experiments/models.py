@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.study import StudySettings
 from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion
 from cobevglue.perception import PointPillars
+from cobevglue.perception.checkpoint import fingerprint
 
 __all__ = ["Models"]
 
@@ -102,18 +102,10 @@ class Models:
     def _fingerprint_of(self, name: str) -> str:
         if name not in self._fingerprints:
             method = self.method(name)
-            self._fingerprints[name] = _fingerprint(method if isinstance(method, nn.Module) else self.detector)
+            self._fingerprints[name] = fingerprint(method if isinstance(method, nn.Module) else self.detector)
         return self._fingerprints[name]
 
     @property
     def detector_fingerprint(self) -> str:
         """The same of the detector."""
-        return _fingerprint(self.detector)
-
-
-def _fingerprint(module: nn.Module) -> str:
-    digest = hashlib.sha256()
-    for name, value in module.state_dict().items():
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+        return fingerprint(self.detector)

@@ -20,7 +20,6 @@ from cobevglue.experiments.study import StudySettings, drive_frames, drive_names
 from cobevglue.experiments.tables.noise import noise_curves
 from cobevglue.experiments.tables.registration import registration_points
 from cobevglue.experiments.tables.scope import Scope, aligner_title, as_is, method_title, needs
-from cobevglue.fusion import FUSION_METHODS
 from cobevglue.se2 import SE2
 from cobevglue.system import CoBEVGlue, StepOutput
 from cobevglue.typing import FloatArray
@@ -76,7 +75,7 @@ def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> lis
     (ours,) = scope.localised
     pictures = []
     for name in _SHOWN:
-        if name in FUSION_METHODS:
+        if name in scope.methods:
             out = _run(as_is(name, _NOISE), drive, models, settings.seed)
             title = f"{method_title(name)}, noise {_NOISE:g} m, {_NOISE:g}°"
             caption = f"{title}: true boxes in green, detections of score {_SCORE:g} and more in red."

@@ -10,7 +10,7 @@ from cobevglue.experiments.models import Models
 from cobevglue.experiments.pictures import Picture, noise_pictures, registration_pictures, scene_pictures
 from cobevglue.experiments.report import Part, write_report
 from cobevglue.experiments.runner import run_study
-from cobevglue.experiments.study import StudySettings
+from cobevglue.experiments.study import StudySettings, drive_names
 from cobevglue.experiments.table import Table
 from cobevglue.experiments.tables import Experiment, Scope, conditions_of
 
@@ -51,6 +51,8 @@ def reproduce(
     labels = [settings.label for settings in studies]
     if len(set(labels)) < len(labels):
         raise ValueError(f"the same data twice: {', '.join(labels)}")
+    for settings in studies:
+        drive_names(settings)  # what is not there is said before hours of work
     conditions = conditions_of(experiments, scope)
     parts = []
     for settings in studies:

@@ -35,7 +35,7 @@ def _rows(scope: Scope) -> dict[str, dict[str, Any]]:
         "Given pose, CoBEVGlue's fusion": {"fusion": ours, "aligner": "given"},
     }
     for name in ("late", "coalign"):
-        if name in FUSION_METHODS:
+        if name in scope.methods:
             rows[f"{method_title(name)}, {aligner_title(FUSION_METHODS[name].usual_aligner)}"] = {"fusion": name}
     return rows
 

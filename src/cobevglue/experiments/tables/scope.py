@@ -51,6 +51,8 @@ _ALIGNER_TITLES = {
     "fpfh-teaser": "FPFH + TEASER",
 }
 
+_ALWAYS = ("none", "cobevglue")
+
 
 @dataclass(frozen=True)
 class Scope:
@@ -63,6 +65,7 @@ class Scope:
         registration_every: registration is run on every so many frames.
         trusting_every: how often the methods that trust poses are run under further disturbances, as this is their own
             table's only and they do not remember.
+        only: fusion methods to be compared with no collaboration and CoBEVGlue; None for all.
     """
 
     levels: Sequence[float] = (0.0, 0.5, 1.5, 2.5)
@@ -70,11 +73,12 @@ class Scope:
     budgets: Sequence[int] = (8_000, 64_000, 512_000)
     registration_every: int = 4
     trusting_every: int = 2
+    only: Sequence[str] | None = None
 
     @property
     def methods(self) -> list[str]:
-        """All fusion methods, in the order of the paper's Table 1."""
-        return list(FUSION_METHODS)
+        """The fusion methods, in the order of the paper's Table 1."""
+        return [name for name in FUSION_METHODS if self.only is None or name in (*self.only, *_ALWAYS)]
 
     @property
     def trusting(self) -> list[str]:
