@@ -53,7 +53,8 @@ def test_a_run_is_one_document_with_json(tmp_path: Path, capsys: pytest.CaptureF
         (["train", "detector", "--config", "tinny"], "did you mean 'tiny'"),  # a preset with a typing error
         (["train", "detector", "--config", "gone.yaml"], "gone.yaml"),  # a file that is not there
         (["train", "detector", "--config", "tiny", "--set", "sead=1"], "did you mean 'seed'"),
-        (["train", "fusion", "--config", "tiny"], "detector"),  # a stage that does not exist
+        (["train", "fusoin", "--config", "tiny"], "detector"),  # a stage that does not exist
+        (["train", "fusion", "--config", "coalgin"], "did you mean 'coalign'"),
         (["train", "detector", "--config", "tiny", "--resume", "--out", "nowhere"], "no epoch of this run"),
     ],
 )

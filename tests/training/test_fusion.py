@@ -99,7 +99,7 @@ def test_unfinished_features_are_not_opened(tmp_path: Path) -> None:
 
 
 def test_training_learns_and_leaves_the_encoder_alone(detector_file: Path, features: Path, tmp_path: Path) -> None:
-    long = OptimisationConfig(epochs=4, samples_per_epoch=16, batch_size=4, learning_rate=3e-3, mean_decay=0.5)
+    long = OptimisationConfig(epochs=4, samples_per_epoch=32, batch_size=4, learning_rate=1e-2, mean_decay=0.5)
     result = train_fusion(config(detector_file, features, optimisation=long), tmp_path, report=silent)
     assert result.finished
     assert set(result.metrics) == {"ap_0.5", "ap_0.7"}

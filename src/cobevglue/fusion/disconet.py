@@ -21,6 +21,10 @@ class EarlyTeacher(MultiScaleFusion):
     It is trained, saved and loaded as any method is, but is none: what is asked for in use it does not have.
     """
 
+    def turned_channels(self) -> Sequence[int]:
+        """None: all points are in the ego's frame."""
+        return []
+
     def fused(self, samples: Sequence[FusionSample]) -> list[Tensor]:
         """The maps of the merged cloud.
 
