@@ -114,7 +114,7 @@ def test_in_the_plane_lines_slide_along_each_other() -> None:
     wall = np.column_stack([rng.uniform(-20.0, 20.0, 800), np.full(800, 5.0)])
     truth, claimed = SE2(3.0, 1.0, 0.1), SE2(3.4, 0.4, 0.13)
     other = truth.inverse().apply(wall)
-    found = planar_icp(wall, other, claimed)
+    found = planar_icp(wall, other, claimed, (5.0, 1.0))
     assert np.abs(found.apply(other)[:, 1] - 5.0).max() < 1e-3
     assert found.apply(other)[:, 0].mean() == pytest.approx(claimed.apply(other)[:, 0].mean(), abs=0.1)
 
@@ -123,8 +123,24 @@ def test_exact_points_give_the_exact_motion() -> None:
     rng = np.random.default_rng([3, 0, 0])
     points = rng.uniform(-20.0, 20.0, (60, 2))
     truth = SE2(-2.0, 7.0, 1.0)
-    found = planar_icp(truth.apply(points), points, truth @ SE2(0.2, -0.1, 0.01))
+    found = planar_icp(truth.apply(points), points, truth @ SE2(0.2, -0.1, 0.01), (2.0,))
     assert found.error_to(truth) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+@BOTH
+def test_pairs_may_be_as_far_apart_as_the_gates_say(name: str) -> None:
+    """From 3 m off, one narrow gate sees little of what belongs together; a wide one first does."""
+    off = SE2(2.5, 1.6, 0.0)
+    narrow, wide = (align(group_aligner(name, gates=gates), pair(off))["other"] for gates in ((0.5,), (5.0, 0.5)))
+    assert error(wide, TRUTH)[0] < 0.1
+    assert error(narrow, TRUTH)[0] > 0.5
+
+
+@BOTH
+@pytest.mark.parametrize("gates", [(), (0.0,), (1.0, -1.0), (math.nan,)])
+def test_settings_are_checked(name: str, gates: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="gates"):
+        group_aligner(name, gates=gates)
 
 
 def test_without_small_gicp_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

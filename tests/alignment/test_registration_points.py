@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from cobevglue import SE2
 from cobevglue.alignment import ALIGNERS, Observation, group_aligner
-from cobevglue.alignment.registration.points import PointAligner, height_above_ground, one_per_voxel, within_reach
+from cobevglue.alignment.registration.points import (
+    PointAligner,
+    Sketch,
+    height_above_ground,
+    one_per_voxel,
+    within_reach,
+)
 from cobevglue.typing import Float32Array
 
 from .observations import cloud_of, pose_of, scene
@@ -54,19 +60,20 @@ def test_a_message_of_nothing_fits_the_smallest_budget(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("budget", [None, 5000])
 def test_points_arrive_within_a_centimetre(name: str, budget: int | None) -> None:
-    """Each is a point of the sketch, rounded; and what was not told does not arrive."""
+    """Each is one that the method looks at, rounded; and what was not told does not arrive."""
     observation = seen_by(name)
     one = aligner(name, budget)
     arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
-    sketch = one.sketch(within_reach(CLOUD))
+    standing = one.standing(within_reach(CLOUD))
+    assert isinstance(arrived, Sketch)
     assert arrived.points is not None
-    assert arrived.points.shape[1] == sketch.shape[1]
+    assert arrived.points.shape[1] == standing.shape[1] == (2 if name == "icp-2d" else 3)
     assert arrived.points.dtype == np.float32
-    rounded = {tuple(row) for row in np.round(sketch * 100.0).astype(int).tolist()}
+    rounded = {tuple(row) for row in np.round(standing * 100.0).astype(int).tolist()}
     assert {tuple(row) for row in np.round(arrived.points * 100.0).astype(int).tolist()} <= rounded
     assert np.abs(arrived.points * 100.0 - np.round(arrived.points * 100.0)).max() < 0.01
     if budget is None:
-        np.testing.assert_allclose(arrived.points, sketch, atol=0.00501)
+        np.testing.assert_allclose(arrived.points, standing[one_per_voxel(standing, one.voxel)], atol=0.00501)
     assert (arrived.boxes, arrived.variance, arrived.features) == (None, None, None)
     if name == "fpfh-teaser":
         assert arrived.pose is None
@@ -79,7 +86,10 @@ def test_what_arrived_is_looked_at_as_it_is(name: str) -> None:
     one = aligner(name)
     observation = seen_by(name)
     arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
-    np.testing.assert_allclose(one.sketch_of(arrived), one.sketch_of(observation), atol=0.00501)
+    assert one.sketch(arrived) is arrived
+    mine = one.sketch(observation)
+    assert mine.voxel == arrived.voxel == one.voxel
+    np.testing.assert_allclose(arrived.points, mine.points, atol=0.00501)
 
 
 def test_the_same_frame_is_the_same_bytes_and_another_frame_another_sample() -> None:
@@ -91,15 +101,18 @@ def test_the_same_frame_is_the_same_bytes_and_another_frame_another_sample() -> 
 
 
 def test_the_sample_is_spread_evenly() -> None:
-    """A tenth of the points is about a tenth of those on each side."""
-    one = aligner("icp-3d", 20_000)
+    """No two points share a cell of the grid that the message names; and one step coarser, they would be too few."""
     observation = seen_by("icp-3d")
-    arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
-    assert arrived.points is not None
-    whole = one.sketch_of(observation)
-    share = len(arrived.points) / len(whole)
-    for side in (-1.0, 1.0):
-        assert (side * arrived.points[:, 1] > 0).sum() == pytest.approx(share * (side * whole[:, 1] > 0).sum(), rel=0.1)
+    for budget in (20_000, 5_000, 1_000):
+        one = aligner("icp-3d", budget)
+        arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
+        assert isinstance(arrived, Sketch)
+        assert arrived.points is not None
+        standing = one.standing(within_reach(CLOUD))
+        kept = standing[one_per_voxel(standing, arrived.voxel)]
+        sent_rows = {tuple(row) for row in np.round(arrived.points * 100.0).astype(int).tolist()}
+        assert sent_rows <= {tuple(row) for row in np.round(kept * 100.0).astype(int).tolist()}
+        assert len(one_per_voxel(standing, 1.05 * arrived.voxel)) < len(arrived.points) <= len(kept)
 
 
 @pytest.mark.parametrize("name", NAMES)

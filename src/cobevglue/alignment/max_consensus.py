@@ -47,8 +47,8 @@ class MaximumConsensus(GroupAligner):
 
     def __init__(
         self,
-        shift: float = 3.0,
-        turn: float = math.radians(3.0),
+        shift: float = 6.0,
+        turn: float = math.radians(6.0),
         distance: float = 1.0,
         min_consensus: int = 4,
     ) -> None:
@@ -59,11 +59,13 @@ class MaximumConsensus(GroupAligner):
         if not min_consensus >= 2:
             raise ValueError(f"min_consensus must be >= 2, as fewer give no pose, got {min_consensus}")
         self.distance, self.min_consensus = distance, min_consensus
-        steps = _STEP * np.arange(-int(shift / _STEP + 1e-9), int(shift / _STEP + 1e-9) + 1)
-        shifts = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        count = int(turn / _TURN_STEP + 1e-9)
+        count = int(shift / _STEP + 1e-9)
+        self._steps = _STEP * np.arange(-count, count + 1)
+        shifts = np.stack(np.meshgrid(self._steps, self._steps, indexing="ij"), axis=-1).reshape(-1, 2)
         # The nearest come first, and the first of equally good ones wins.
-        self._shifts = shifts[np.argsort(np.hypot(*shifts.T), kind="stable")]
+        self._order = np.argsort(np.hypot(*shifts.T), kind="stable")
+        self._shifts = shifts[self._order]
+        count = int(turn / _TURN_STEP + 1e-9)
         self._turns = sorted((_TURN_STEP * k for k in range(-count, count + 1)), key=abs)
 
     def align_group(
@@ -99,15 +101,16 @@ class MaximumConsensus(GroupAligner):
     def _scores(self, ego: FloatArray, other: FloatArray) -> FloatArray:
         """(S,) for each shift of other's centres how many of them agree; less a share below 1 for their distances."""
         gap = ego[None] - other[:, None]
-        reach = self._shifts.max(initial=0.0) + self.distance
+        reach = self._steps[-1] + self.distance
         rows, columns = np.nonzero((np.abs(gap) <= reach).all(axis=2))
         if not len(rows):
             return np.zeros(len(self._shifts))
-        squared = ((gap[rows, columns][:, None] - self._shifts) ** 2).sum(axis=2) / self.distance**2
+        x, y = ((gap[rows, columns, axis][:, None] - self._steps) ** 2 / self.distance**2 for axis in range(2))
+        squared = (x[:, :, None] + y[:, None, :]).reshape(len(rows), -1)
         firsts = np.flatnonzero(np.diff(rows, prepend=-1))
         nearest = np.minimum.reduceat(squared, firsts, axis=0)
         scores: FloatArray = np.where(nearest <= 1.0, 1.0 - nearest / (len(firsts) + 1), 0.0).sum(axis=0)
-        return scores
+        return scores[self._order]
 
 
 def mutual_nearest(ego: FloatArray, other: FloatArray, distance: float) -> IntArray:

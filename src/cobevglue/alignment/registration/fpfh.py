@@ -10,24 +10,24 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.group import Observation
-from cobevglue.alignment.registration.points import PointAligner, height_above_ground, one_per_voxel
+from cobevglue.alignment.registration.points import PointAligner, Sketch, height_above_ground
 from cobevglue.alignment.registration.robust import Motion, robust_motion, teaserpp_motion
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray, IntArray
 
 __all__ = ["FPFHTeaser"]
 
-_VOXEL = 0.5
-_NORMAL_RADIUS, _NORMAL_NEIGHBOURS = 1.0, 30
-_FEATURE_RADIUS, _FEATURE_NEIGHBOURS = 2.5, 100
-_NOISE_BOUND = 0.5
-"""How far two points that were matched rightly may be from each other: the voxels' size [m]."""
+_NORMAL_RADIUS, _NORMAL_NEIGHBOURS = 2.0, 30
+_FEATURE_RADIUS, _FEATURE_NEIGHBOURS = 5.0, 100
+"""Radii in voxels, as is usual."""
+_NOISE_BOUND, _NOISE_VOXELS = 0.5, 0.7
+"""How far two points that were matched rightly may be from each other: metres, or voxels where that is more."""
 _MOST_MATCHES = 1000
 _FEWEST_POINTS = 10
 
@@ -35,9 +35,9 @@ _FEWEST_POINTS = 10
 class FPFHTeaser(PointAligner):
     """The pose that most matched descriptors agree on; refused where too few do. It sees no pose.
 
-    The sketch is what is more than 0.3 m above the ground, one point for each cube of 0.5 m; 6 bytes a point. Only
-    points travel: the receiver computes the descriptors of what arrived, as 33 numbers a point would cost 11 times as
-    much. The motion is found in space, and its planar part is kept.
+    Only points travel, 6 bytes each: the receiver computes the descriptors of what arrived, as their 33 numbers would
+    cost many times more. It samples its own cloud on the same grid, since descriptors depend on the density. The motion
+    is found in space, and its planar part is kept.
 
     Args:
         budget_bytes: see `PointAligner`.
@@ -49,6 +49,7 @@ class FPFHTeaser(PointAligner):
     """
 
     needs = frozenset({"points"})
+    voxel = 0.5
 
     def __init__(self, budget_bytes: int | None = None, min_inliers: int = 10) -> None:
         super().__init__(budget_bytes)
@@ -56,43 +57,55 @@ class FPFHTeaser(PointAligner):
             raise ValueError(f"min_inliers must be >= 4, as fewer always agree, got {min_inliers}")
         self.min_inliers = min_inliers
 
-    def sketch(self, points: FloatArray) -> FloatArray:
-        """(n, 3) what stands on the ground, thinned."""
-        standing = points[height_above_ground(points) > 0.3]
-        return standing[one_per_voxel(standing, _VOXEL)]
+    def standing(self, points: FloatArray) -> FloatArray:
+        """(n, 3) what is more than 0.3 m above the ground, of which every point looks like every other."""
+        return points[height_above_ground(points) > 0.3]
 
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
     ) -> dict[str, Alignment]:
         """Each collaborator by itself."""
-        own = self.sketch_of(observations[ego])
-        described = _features(own) if len(own) >= _FEWEST_POINTS else None
+        own: dict[float, _Described | None] = {}
         found = {}
         for name, observation in observations.items():
             if name != ego:
-                points = self.sketch_of(observation)
-                few = described is None or len(points) < _FEWEST_POINTS
-                found[name] = Alignment.refused("too few points") if few else self._align(own, described, points)
+                sketch = self.sketch(observation)
+                if sketch.voxel not in own:
+                    own[sketch.voxel] = _describe(self.sketch(observations[ego], sketch.voxel))
+                found[name] = self._align(own[sketch.voxel], _describe(sketch), sketch.voxel)
         return found
 
-    def _align(self, ego: FloatArray, described: Any, other: FloatArray) -> Alignment:
-        pairs = _matched(described, _features(other))
-        motion = _motion(ego[pairs[:, 0]], other[pairs[:, 1]])
+    def _align(self, ego: _Described | None, other: _Described | None, voxel: float) -> Alignment:
+        if ego is None or other is None:
+            return Alignment.refused("too few points")
+        pairs = _matched(ego.features, other.features)
+        motion = _motion(ego.points[pairs[:, 0]], other.points[pairs[:, 1]], max(_NOISE_BOUND, _NOISE_VOXELS * voxel))
         if len(motion.inliers) < self.min_inliers:
-            return Alignment.refused(f"{len(motion.inliers)} matched points agree, not {self.min_inliers}")
+            return Alignment.refused(f"{len(motion.inliers)} matched points agree, fewer than {self.min_inliers}")
         ego_SE3_other = np.eye(4)
         ego_SE3_other[:3, :3], ego_SE3_other[:3, 3] = motion.rotation, motion.translation
         return Alignment(SE2.from_matrix(ego_SE3_other))
 
 
-def _features(points: FloatArray) -> Any:
-    """The FPFH descriptors of (n, 3) points in their LiDAR's frame, as Open3D holds them."""
-    library = _open3d()
+class _Described(NamedTuple):
+    """(n, 3) points [m], and their descriptors as Open3D holds them."""
+
+    points: FloatArray
+    features: Any
+
+
+def _describe(sketch: Sketch) -> _Described | None:
+    """The FPFH descriptors of a cloud in its LiDAR's frame; None of next to no points."""
+    assert sketch.points is not None
+    if len(sketch.points) < _FEWEST_POINTS:
+        return None
+    library, points = _open3d(), sketch.points.astype(np.float64)
     near = library.geometry.KDTreeSearchParamHybrid
     cloud = library.geometry.PointCloud(library.utility.Vector3dVector(points))
-    cloud.estimate_normals(near(_NORMAL_RADIUS, _NORMAL_NEIGHBOURS))
+    cloud.estimate_normals(near(_NORMAL_RADIUS * sketch.voxel, _NORMAL_NEIGHBOURS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
-    return library.pipelines.registration.compute_fpfh_feature(cloud, near(_FEATURE_RADIUS, _FEATURE_NEIGHBOURS))
+    describe = library.pipelines.registration.compute_fpfh_feature
+    return _Described(points, describe(cloud, near(_FEATURE_RADIUS * sketch.voxel, _FEATURE_NEIGHBOURS)))
 
 
 def _matched(ego: Any, other: Any) -> IntArray:
@@ -103,12 +116,12 @@ def _matched(ego: Any, other: Any) -> IntArray:
     return pairs[np.argsort(distance, kind="stable")[:_MOST_MATCHES]].astype(np.int64)
 
 
-def _motion(ego: FloatArray, other: FloatArray) -> Motion:
+def _motion(ego: FloatArray, other: FloatArray, noise_bound: float) -> Motion:
     try:
         import teaserpp_python
     except ImportError:
-        return robust_motion(ego, other, _NOISE_BOUND)
-    return teaserpp_motion(teaserpp_python, ego, other, _NOISE_BOUND)
+        return robust_motion(ego, other, noise_bound)
+    return teaserpp_motion(teaserpp_python, ego, other, noise_bound)
 
 
 @cache

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.group import Observation
-from cobevglue.alignment.registration.points import PointAligner, height_above_ground, one_per_voxel
+from cobevglue.alignment.registration.points import PointAligner, height_above_ground
 from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray
 
 __all__ = ["ICP2D", "ICP3D", "planar_icp"]
 
-_GATES = (5.0, 2.0, 1.0)
-"""How far apart a pair may be, one stage after the other [m]."""
 _FEWEST_POINTS = 10
 _FARTHEST, _WIDEST = 15.0, math.radians(45.0)
 """Whatever ends further than this from the claimed pose has diverged [m, rad]."""
@@ -34,19 +32,25 @@ class _ICP(PointAligner):
 
     needs = frozenset({"points", "pose"})
 
+    def __init__(self, budget_bytes: int | None = None, gates: Sequence[float] = (5.0, 2.0, 1.0)) -> None:
+        super().__init__(budget_bytes)
+        if not gates or not all(0.0 < gate < math.inf for gate in gates):
+            raise ValueError(f"gates must be distances > 0, at least one, got {list(gates)}")
+        self.gates = tuple(gates)
+
     @abstractmethod
     def refine(self, ego: Any, other: FloatArray, ego_SE3_other: FloatArray) -> SE2:
         """The refined pose.
 
         Args:
-            ego: what `prepare` made of the ego's sketch.
-            other: (n, D) the other's sketch.
+            ego: what `prepare` made of the ego's points.
+            other: (n, D) the other's points.
             ego_SE3_other: (4, 4) as claimed.
         """
 
-    def prepare(self, sketch: FloatArray) -> Any:
-        """What is needed of the ego's sketch whoever the other is."""
-        return sketch
+    def prepare(self, points: FloatArray) -> Any:
+        """What is needed of the ego's (N, D) points whoever the other is."""
+        return points
 
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
@@ -58,8 +62,8 @@ class _ICP(PointAligner):
         """
         own = observations[ego].pose
         assert own is not None
-        sketch = self.sketch_of(observations[ego])
-        prepared = self.prepare(sketch) if len(sketch) >= _FEWEST_POINTS else None
+        points = self._points(observations[ego])
+        prepared = self.prepare(points) if len(points) >= _FEWEST_POINTS else None
         found = {}
         for name, observation in observations.items():
             if name == ego:
@@ -67,7 +71,7 @@ class _ICP(PointAligner):
             assert observation.pose is not None
             ego_SE3_other = inverse_SE3(own) @ observation.pose
             claimed = SE2.from_matrix(ego_SE3_other)
-            points = self.sketch_of(observation)
+            points = self._points(observation)
             if prepared is None or len(points) < _FEWEST_POINTS:
                 found[name] = Alignment(claimed)
                 continue
@@ -81,48 +85,62 @@ class _ICP(PointAligner):
                 found[name] = Alignment(pose)
         return found
 
+    def _points(self, observation: Observation) -> FloatArray:
+        points = self.sketch(observation).points
+        assert points is not None
+        return points.astype(np.float64)
+
 
 class ICP2D(_ICP):
-    """ICP in the plane: what stands on the ground, seen from above.
+    """ICP in the plane: what stands on the ground, seen from above, 4 bytes a point.
 
-    The sketch is the points 0.5 m to 4 m above the ground, without their heights, one for each square of 0.2 m; 4 bytes
-    a point. See `PointAligner` for the argument and `align_group` for what is refused.
+    Args:
+        budget_bytes: see `PointAligner`.
+        gates: how far apart a pair may be, one stage after the other [m].
+
+    Raises:
+        ValueError: a setting out of its range.
     """
 
-    def sketch(self, points: FloatArray) -> FloatArray:
-        """(n, 2) the band above the ground."""
+    voxel = 0.2
+
+    def standing(self, points: FloatArray) -> FloatArray:
+        """(n, 2) what is 0.5 m to 4 m above the ground, without its height."""
         height = height_above_ground(points)
-        band = points[(height > 0.5) & (height < 4.0), :2]
-        return band[one_per_voxel(band, 0.2)]
+        return points[(height > 0.5) & (height < 4.0), :2]
 
     def refine(self, ego: FloatArray, other: FloatArray, ego_SE3_other: FloatArray) -> SE2:
         """By `planar_icp`."""
-        return planar_icp(ego, other, SE2.from_matrix(ego_SE3_other))
+        return planar_icp(ego, other, SE2.from_matrix(ego_SE3_other), self.gates)
 
 
 class ICP3D(_ICP):
-    """ICP in space: GICP of `small_gicp`. Of its result the planar part is kept.
+    """ICP in space: GICP of `small_gicp`, 6 bytes a point. Of its result the planar part is kept.
 
-    The sketch is one point for each cube of 0.3 m; 6 bytes a point. See `PointAligner` for the argument and
-    `align_group` for what is refused.
+    Args:
+        budget_bytes: see `PointAligner`.
+        gates: how far apart a pair may be, one stage after the other [m].
 
     Raises:
+        ValueError: a setting out of its range.
         ModuleNotFoundError: when first used: small_gicp is not installed.
     """
 
-    def sketch(self, points: FloatArray) -> FloatArray:
-        """(n, 3) the cloud, thinned."""
-        return points[one_per_voxel(points, 0.3)]
+    voxel = 0.3
 
-    def prepare(self, sketch: FloatArray) -> Any:
+    def standing(self, points: FloatArray) -> FloatArray:
+        """(n, 3) what is more than 0.3 m above the ground, which would take up most of the budget and say little."""
+        return points[height_above_ground(points) > 0.3]
+
+    def prepare(self, points: FloatArray) -> Any:
         """The points with their covariances, and a tree of them."""
-        return _small_gicp().preprocess_points(sketch, downsampling_resolution=0.01)
+        return _small_gicp().preprocess_points(points, downsampling_resolution=0.01)
 
     def refine(self, ego: Any, other: FloatArray, ego_SE3_other: FloatArray) -> SE2:
         """By GICP with ever nearer pairs."""
         library = _small_gicp()
         (target, tree), (source, _) = ego, self.prepare(other)
-        for gate in _GATES:
+        for gate in self.gates:
             result = library.align(
                 target,
                 source,
@@ -136,13 +154,14 @@ class ICP3D(_ICP):
         return SE2.from_matrix(ego_SE3_other)
 
 
-def planar_icp(ego: FloatArray, other: FloatArray, ego_SE2_other: SE2) -> SE2:
+def planar_icp(ego: FloatArray, other: FloatArray, ego_SE2_other: SE2, gates: Sequence[float]) -> SE2:
     """Point-to-line ICP (Censi, ICRA 2008): the distance of other's points to the lines through their nearest points.
 
     Args:
         ego: (N, 2) points [m], at least 10.
         other: (M, 2) points [m].
         ego_SE2_other: where to start.
+        gates: how far apart a pair may be, one stage after the other [m].
 
     Returns:
         The refined ego_SE2_other; less refined where fewer than 10 points find another.
@@ -151,7 +170,7 @@ def planar_icp(ego: FloatArray, other: FloatArray, ego_SE2_other: SE2) -> SE2:
 
     tree = KDTree(ego)
     normal = _normals(ego, tree)
-    for gate in _GATES:
+    for gate in gates:
         for _ in range(15):
             moved = ego_SE2_other.apply(other)
             distance, nearest = tree.query(moved, distance_upper_bound=gate)

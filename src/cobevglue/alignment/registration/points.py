@@ -1,10 +1,11 @@
-"""What a registration baseline is told of another agent's cloud: a sample of it that fits a budget of bytes."""
+"""What a registration baseline is told of another agent's cloud: a sketch of it that fits a budget of bytes."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from cobevglue.alignment.group import GroupAligner, Observation
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.typing import Float32Array, FloatArray, IntArray
 
-__all__ = ["PointAligner", "height_above_ground", "one_per_voxel", "within_reach"]
+__all__ = ["PointAligner", "Sketch", "height_above_ground", "one_per_voxel", "within_reach"]
 
 MIN_BUDGET = 256
 """Bytes in which a claimed pose and no points at all fit."""
@@ -20,33 +21,51 @@ _UNIT = 0.01
 """Coordinates travel as whole centimetres in int16 …"""
 _REACH = 300.0
 """… and so cannot be farther than 327 m."""
+_COARSER, _COARSEST = 1.05, 140
+"""From one grid to the next, and how many there are: up to a thousandfold."""
 _STREAM = 70
 
 _GROUND_RADIUS, _GROUND_BIN, _GROUND_TOLERANCES, _FEWEST_ON_GROUND = 40.0, 0.2, (1.0, 0.7, 0.5, 0.3, 0.2), 10
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sketch(Observation):
+    """An observation as it arrives: its `points` are (n, D), sampled, and without intensity.
+
+    Attributes:
+        voxel: size of the grid that they were sampled on [m].
+    """
+
+    voxel: float = 0.0
+
+
 class PointAligner(GroupAligner):
     """Aligns by points. Those of another agent arrive sampled, so that its messages fit the budget.
 
-    The sender takes what the method looks at (`sketch`: one point per voxel), and of that as many as fit, drawn evenly
-    and the same ones every time. They travel as int16 centimetres. What arrives as `Observation.points` is the sketch,
-    (n, 2) or (n, 3), in place of the cloud, (N, 4), and is told from it by that; the ego's own cloud is not sampled
-    further.
+    The sender takes what the method looks at (`standing`), and of that one point for each voxel. If these do not fit,
+    the grid is made coarser, by 5 % each time, as long as it still has as many points as fit; what is too much then is
+    dropped at random, in the same way every time. Points travel as int16 centimetres. The ego's own cloud is not
+    limited.
 
     Args:
         budget_bytes: of all that an agent sends for alignment in a frame, a claimed pose included; None for no limit.
+
+    Attributes:
+        voxel: size of the finest grid [m].
 
     Raises:
         ValueError: a budget of less than 256 bytes.
     """
 
+    voxel: ClassVar[float]
+
     def __init__(self, budget_bytes: int | None = None) -> None:
-        if budget_bytes is not None and budget_bytes < MIN_BUDGET:
+        if budget_bytes is not None and not budget_bytes >= MIN_BUDGET:
             raise ValueError(f"budget_bytes must be at least {MIN_BUDGET} or None, got {budget_bytes}")
         self.budget_bytes = budget_bytes
 
     @abstractmethod
-    def sketch(self, points: FloatArray) -> FloatArray:
+    def standing(self, points: FloatArray) -> FloatArray:
         """What the method looks at of a cloud.
 
         Args:
@@ -56,31 +75,62 @@ class PointAligner(GroupAligner):
             (n, D) points, D = 2 or 3, in that frame.
         """
 
-    def sketch_of(self, observation: Observation) -> FloatArray:
-        """(n, D) the sketch of an observation, made here unless it is what arrived."""
-        points = observation.points
-        assert points is not None
-        if points.ndim == 2 and points.shape[1] < 4:
-            return points.astype(np.float64)
-        return self.sketch(within_reach(points))
+    def sketch(self, observation: Observation, voxel: float | None = None) -> Sketch:
+        """What arrived, as it is; of another observation all that the method looks at, on a grid of this size [m].
+
+        Args:
+            observation: of any agent.
+            voxel: of the grid; the finest by default.
+        """
+        if isinstance(observation, Sketch):
+            return observation
+        voxel = self.voxel if voxel is None else voxel
+        points = self._looked_at(observation)
+        points = points[one_per_voxel(points, voxel)]
+        return Sketch(points=points.astype(np.float32), pose=observation.pose, voxel=voxel)
 
     def encode(self, agent: str, observation: Observation, time: float, frame: int) -> dict[str, bytes]:
         """The messages of an agent, of at most `budget_bytes` together."""
         parts = super().encode(agent, replace(observation, points=None), time, frame)
-        points = np.round(self.sketch_of(observation) / _UNIT).astype(np.int16)
+        points, level = self._looked_at(observation), 0
+        rows = one_per_voxel(points, self.voxel)
         if self.budget_bytes is not None:
-            spent = sum(map(len, parts.values())) + len(encode_arrays({"points": points[:0]}))
-            count = max(0, self.budget_bytes - spent) // points[:1].nbytes if len(points) else 0
-            if count < len(points):
+            left = self.budget_bytes - sum(map(len, parts.values())) - len(_encode(points[:0], 0))
+            most = max(0, left // (2 * points.shape[1]))
+            if most < len(rows):
+                level = self._coarsest(points, most)
+                rows = one_per_voxel(points, self._size(level))
                 rng = np.random.default_rng([0, _STREAM, frame])
-                points = points[np.sort(rng.choice(len(points), count, replace=False))]
-        return {**parts, "points": encode_arrays({"points": points})}
+                rows = np.sort(rng.choice(rows, most, replace=False))
+        return {**parts, "points": _encode(points[rows], level)}
 
-    def decode(self, parts: Mapping[str, bytes], observation: Observation) -> Observation:
-        """What the ego reads in them: the sampled sketch [m] in place of the points."""
-        others = {name: data for name, data in parts.items() if name != "points"}
-        points = decode_arrays(parts["points"])["points"] * np.float32(_UNIT)
-        return replace(super().decode(others, observation), points=points)
+    def decode(self, parts: Mapping[str, bytes], observation: Observation) -> Sketch:
+        """What the ego reads in them."""
+        pose = super().decode({name: data for name, data in parts.items() if name != "points"}, observation).pose
+        arrays = decode_arrays(parts["points"])
+        points = arrays["points"] * np.float32(_UNIT)
+        return Sketch(points=points, pose=pose, voxel=self._size(int(arrays["grid"])))
+
+    def _looked_at(self, observation: Observation) -> FloatArray:
+        assert observation.points is not None
+        return self.standing(within_reach(observation.points))
+
+    def _coarsest(self, points: FloatArray, least: int) -> int:
+        """The coarsest grid with at least so many voxels that have points; 0 is the finest, which has as many."""
+        fine, coarse = 0, _COARSEST
+        while coarse - fine > 1:
+            middle = (fine + coarse) // 2
+            enough = len(one_per_voxel(points, self._size(middle))) >= least
+            fine, coarse = (middle, coarse) if enough else (fine, middle)
+        return fine
+
+    def _size(self, level: int) -> float:
+        return self.voxel * _COARSER**level
+
+
+def _encode(points: FloatArray, level: int) -> bytes:
+    centimetres = np.round(points / _UNIT).astype(np.int16)
+    return encode_arrays({"points": centimetres, "grid": np.array(level, np.uint8)})
 
 
 def within_reach(points: Float32Array | FloatArray) -> FloatArray:
