@@ -88,6 +88,8 @@ def test_what_arrived_is_looked_at_as_it_is(name: str) -> None:
     arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
     assert one.sketch(arrived) is arrived
     mine = one.sketch(observation)
+    assert mine.points is not None
+    assert arrived.points is not None
     assert mine.voxel == arrived.voxel == one.voxel
     np.testing.assert_allclose(arrived.points, mine.points, atol=0.00501)
 

