@@ -75,7 +75,9 @@ class Models:
         settings = self._settings
         if not settings.untrained and settings.weights is None:
             return pretrained_fusion(name, self.detector, settings.detector)
-        method = fusion_class(name)(self.detector)
+        with torch.random.fork_rng(devices=[]):  # what is not trained is the same in all processes
+            torch.manual_seed(settings.seed)
+            method = fusion_class(name)(self.detector)
         if isinstance(method, IntermediateFusion) and settings.weights is not None:
             method.load(Path(settings.weights) / f"{name}.safetensors")
         return method
