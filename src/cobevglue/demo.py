@@ -7,13 +7,17 @@ noisy GPS, from GPS under attack, by CoBEVGlue, which gets no position from anyw
 from __future__ import annotations
 
 import math
+import os
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import torch
 
 from cobevglue.alignment import group_aligner
 from cobevglue.boxes import Boxes
@@ -23,6 +27,7 @@ from cobevglue.disturbance import Disturbance, LocalisationNoise, Moment, SamePl
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.evaluation.detection_matching import DROPPED, FALSE, EvaluationRange, inside, match, prepare
 from cobevglue.fusion.none import NoCollaboration
+from cobevglue.perception import PerceptionOutput
 from cobevglue.se2 import SE2
 from cobevglue.simulation.road_network import RoadNetwork
 from cobevglue.simulation.scenario import ScenarioSettings, SimulatedScenario
@@ -52,8 +57,8 @@ ROWS = MappingProxyType(
         EGO_ONLY: "ego only",
         "noisy_gps": "fused on noisy GPS",
         "attacked_gps": "fused under attack",
-        COBEVGLUE: "CoBEVGlue, no GPS",
-        "true_pose": "fused on true poses",
+        COBEVGLUE: "CoBEVGlue",
+        "true_pose": "true pose",
     }
 )
 """What is compared, and how people read it."""
@@ -76,6 +81,7 @@ SCORE, IOU = 0.3, 0.5
 
 _NEAR = 50.0  # what is hidden within this distance concerns the ego [m]
 _MOVING = 1.0  # [m/s]
+_WORKERS_AT_MOST = 4
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -263,11 +269,17 @@ def run_demo(seed: int = 0, *, frames: int = FRAMES, progress: Callable[[int], N
     config = systems[COBEVGLUE].detector.config
     reach = (*config.x_range, *config.y_range)
     ego = _choose_ego(scenario, reach)
-    done = []
-    for index in range(frames):
-        done.append(_frame(scenario, index, ego, systems, reach))
-        if progress is not None:
-            progress(len(done))
+    done: list[DemoFrame] = []
+    with _workers() as workers:
+        coming = workers.submit(scenario.views, 0)
+        for index in range(frames):
+            views = coming.result()
+            if index + 1 < frames:
+                coming = workers.submit(scenario.views, index + 1)
+            scene = _scene(scenario, index, ego, views, reach)
+            done.append(_put_together(scene, _poses(views), scenario.seed, systems, workers))
+            if progress is not None:
+                progress(len(done))
     return DemoResult(seed, scenario.world.roads, tuple(done))
 
 
@@ -292,23 +304,49 @@ def _choose_ego(scenario: SimulatedScenario, reach: EvaluationRange) -> str:
     return max(staying, key=lambda name: len(_scene(scenario, middle, name, views, reach).hidden_movers))
 
 
-def _frame(
-    scenario: SimulatedScenario, index: int, ego: str, systems: Mapping[str, CoBEVGlue], reach: EvaluationRange
+def _put_together(
+    scene: DemoFrame,
+    true: Mapping[str, FloatArray],
+    seed: int,
+    systems: Mapping[str, CoBEVGlue],
+    workers: Executor,
 ) -> DemoFrame:
-    """Simulate one frame, perceive, and put together what was perceived in every row's way."""
-    views = scenario.views(index)
-    scene = _scene(scenario, index, ego, views, reach)
-    seen = {name: systems[COBEVGLUE].perceive(name, points, scene.time) for name, points in scene.points.items()}
+    """Perceive, and put together what was perceived in every row's way; `true` are the poses world_SE3_lidar."""
+
+    def perceive(name: str) -> PerceptionOutput:
+        return systems[COBEVGLUE].perceive(name, scene.points[name], scene.time)
+
+    seen = dict(zip(scene.points, workers.map(perceive, scene.points), strict=True))
     seconds = {"perception": sum(sum(view.seconds.values()) for view in seen.values())}
-    poses = {name: view.world_SE3_lidar for name, view in views.items()}
-    moment = Moment(scene.time, seen, poses, poses)
-    outputs = {}
-    for row, system in systems.items():
-        taking_part = {ego: seen[ego]} if row == EGO_ONLY else seen
-        heard = _GPS.get(row, Undisturbed()).apply([moment], 0, ego, [scenario.seed, index])
+    moment = Moment(scene.time, seen, true, true)
+
+    def collaborate(row: str) -> StepOutput:
+        taking_part = {scene.ego: seen[scene.ego]} if row == EGO_ONLY else seen
+        heard = _GPS.get(row, Undisturbed()).apply([moment], 0, scene.ego, [seed, scene.index])
         claimed = None if row == COBEVGLUE else heard.claimed
-        outputs[row] = system.collaborate(taking_part, ego, scene.time, claimed, seconds)
+        return systems[row].collaborate(taking_part, scene.ego, scene.time, claimed, seconds)
+
+    outputs = dict(zip(systems, workers.map(collaborate, systems), strict=True))
     return replace(scene, tracked={name: view.boxes for name, view in seen.items()}, outputs=outputs)
+
+
+def _poses(views: Mapping[str, LidarView]) -> dict[str, FloatArray]:
+    return {name: view.world_SE3_lidar for name, view in views.items()}
+
+
+@contextmanager
+def _workers() -> Iterator[Executor]:
+    """Threads for what can be done at the same time.
+
+    Meanwhile the network is not spread over threads of its own: on a busy machine they mostly wait for each other.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(min(_WORKERS_AT_MOST, os.cpu_count() or 1)) as workers:
+            yield workers
+    finally:
+        torch.set_num_threads(before)
 
 
 def _scene(

@@ -41,7 +41,7 @@ def test_every_vehicle_and_every_ghost_is_drawn_once(drive: DemoResult, row: str
 
 def test_the_comparison_has_a_plot_for_each_row_it_is_asked_for(drive: DemoResult) -> None:
     titles = [axes.get_title(loc="left").split(":")[0] for axes in draw_comparison(drive).axes]
-    assert titles == ["Ego only", "Fused on noisy GPS", "Fused under attack", "CoBEVGlue, no GPS"]
+    assert titles == ["Ego only", "Fused on noisy GPS", "Fused under attack", "CoBEVGlue"]
 
 
 def test_the_pose_is_drawn_as_three_plots(drive: DemoResult) -> None:

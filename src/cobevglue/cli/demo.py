@@ -55,7 +55,12 @@ def demo(
         print_json({**summary, "files": [str(path) for path in files]})
         return
     header, rows = comparison_table(summary)
-    print_table(f"{summary['agents']} cars, {summary['frames']} frames, as {summary['ego']} has it", header, rows)
+    print_table(
+        f"{summary['vehicles']:.1f} vehicles a frame, {summary['hidden_from_ego']:.1f} of them hidden from the ego",
+        header,
+        rows,
+    )
+    print("off by: median error of the poses; bytes: sent for the pose, a frame and car. More is on the page.")
     print(f"Open {files[0]} to see it ({time.perf_counter() - start:.0f} s).")
 
 

@@ -55,23 +55,14 @@ def comparison_table(summary: dict[str, Any]) -> tuple[list[str], list[list[str]
     Returns:
         The names of the columns, and a row for each of `ROWS`.
     """
-    header = [
-        "",
-        "AP 0.5",
-        "AP 0.7",
-        f"found, of {summary['vehicles']:.1f}",
-        f"hidden found, of {summary['hidden_from_ego']:.1f}",
-        "ghosts",
-        "pose off by",
-        "bytes for the pose",
-        "bytes in all",
-    ]
+    header = ["", "AP 0.5", "AP 0.7", "found", "hidden", "ghosts", "off by", "bytes"]
     rows = []
     for name, row in zip(ROWS.values(), summary["rows"].values(), strict=True):
         scores = [_number(row[key], 3) for key in ("ap_0.5", "ap_0.7")]
         counts = [_number(row[key], 1) for key in ("found", "hidden_found", "ghosts")]
-        sizes = [_number(row[key] or 0.0, 0) for key in ("bytes_for_pose", "bytes_in_all")]
-        rows.append([name, *scores, *counts, _pose_error(row), *sizes])
+        error = row["median_error_m"]
+        off = "–" if error is None else f"{error:.{2 if error < 10.0 else 1}f} m"
+        rows.append([name, *scores, *counts, off, _number(row["bytes_for_pose"] or 0.0, 0)])
     return header, rows
 
 
@@ -92,7 +83,11 @@ def _write_page(result: DemoResult, folder: Path) -> Path:
         ),
         Part(
             "The comparison",
-            table(header, rows, [list(ROWS).index(COBEVGLUE)], _table_notes(summary)),
+            paragraphs(
+                f"On average {summary['vehicles']:.1f} vehicles are in reach in a frame, "
+                f"{summary['hidden_from_ego']:.1f} of them hidden from the ego."
+            )
+            + table(header, rows, [list(ROWS).index(COBEVGLUE)], _table_notes(summary)),
         ),
         Part(
             "The drive",
@@ -160,17 +155,19 @@ def _story(frame: DemoFrame) -> str:
 
 
 def _table_notes(summary: dict[str, Any]) -> list[str]:
+    used = summary["rows"][COBEVGLUE]["poses_used"] or 0.0
     return [
         f"All rows: {summary['frames']} frames, the same clouds and detector and, but for ego only, the same fusion.",
         "AP: average precision at that overlap with the true box, seen from above; 1 is perfect.",
-        f"Found, hidden, ghosts: numbers a frame, at a score of {SCORE:g} and an overlap of {IOU:g} or more. Vehicles "
-        f"count that at least {MIN_POINTS} points of all LiDARs together lie on; hidden ones have fewer than "
-        f"{MIN_POINTS} of the ego's. A ghost is a box that overlaps no vehicle by that much.",
+        "Found, how many of these are hidden from the ego, and ghosts: numbers a frame, at a score of "
+        f"{SCORE:g} and an overlap of {IOU:g} or more. Vehicles count that at least {MIN_POINTS} points of all LiDARs "
+        f"together lie on; hidden ones have fewer than {MIN_POINTS} of the ego's. A ghost is a box that overlaps no "
+        "vehicle by that much.",
         f"Noisy GPS: Gaussian, standard deviation {NOISE.position:g} m in x and in y and {NOISE.yaw:g}° in heading, "
         "for every car anew in every frame. Under attack: the others claim to be where the ego is.",
-        "Pose off by: median over frames and cars, of the poses that were used. CoBEVGlue used "
-        f"{100.0 * (summary['rows'][COBEVGLUE]['poses_used'] or 0.0):.0f} % of them, and refused the rest.",
-        "Bytes: a frame and car that helps, as encoded.",
+        "Off by: how far the pose is from the true one, median over frames and cars, of the poses that were used. "
+        f"CoBEVGlue used {100.0 * used:.0f} % of them, and refused the rest.",
+        "Bytes: what a car that helps sends for its pose, a frame; the features come on top, as said below.",
     ]
 
 
@@ -193,16 +190,11 @@ def _limits(summary: dict[str, Any]) -> str:
     return (
         f"Traffic and LiDARs are simulated, on a road network ({NETWORK}) that nothing was trained on. Detector, "
         "tracker, alignment and fusion are those that run on real clouds. CoBEVGlue gets clouds only: no pose, no map, "
-        "no roads. The ego is the car from which most driving vehicles are hidden, so that there is something to gain."
+        "no roads. The junction is a busy one, and the ego is the car from which most driving vehicles are hidden, so "
+        "that there is something to gain; `cobevglue reproduce` measures on drives that nobody chose."
         f"\n\nTime for a frame of {summary['agents']} cars, the median here: {times or 'not measured'}. On the road, "
         "every car has its own computer for its perception."
     )
-
-
-def _pose_error(row: dict[str, Any]) -> str:
-    if row["median_error_m"] is None:
-        return "–"
-    return f"{row['median_error_m']:.2f} m, {row['median_error_deg']:.1f}°"
 
 
 def _number(value: float | None, digits: int) -> str:
