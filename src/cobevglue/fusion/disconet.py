@@ -75,7 +75,7 @@ class DiscoNet(SingleMapFusion):
             conv_norm(2 * channels, channels, 1),
             conv_norm(channels, channels // 2, 1),
             conv_norm(channels // 2, 8, 1),
-            nn.Conv2d(8, 1, 1),
+            nn.Conv2d(8, 1, 1, bias=False),  # a softmax over agents follows: what is the same for all does nothing
         )
         self.teacher = None
 
