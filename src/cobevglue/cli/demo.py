@@ -60,7 +60,7 @@ def demo(
         header,
         rows,
     )
-    print("off by: median error of the poses; bytes: sent for the pose, a frame and car. More is on the page.")
+    print("off: median error of the poses; bytes: sent for the pose, a frame and car. More is on the page.")
     print(f"Open {files[0]} to see it ({time.perf_counter() - start:.0f} s).")
 
 

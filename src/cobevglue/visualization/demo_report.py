@@ -55,14 +55,12 @@ def comparison_table(summary: dict[str, Any]) -> tuple[list[str], list[list[str]
     Returns:
         The names of the columns, and a row for each of `ROWS`.
     """
-    header = ["", "AP 0.5", "AP 0.7", "found", "hidden", "ghosts", "off by", "bytes"]
+    header = ["", "AP 0.5", "AP 0.7", "found", "hidden", "ghosts", "off", "bytes"]
     rows = []
     for name, row in zip(ROWS.values(), summary["rows"].values(), strict=True):
         scores = [_number(row[key], 3) for key in ("ap_0.5", "ap_0.7")]
         counts = [_number(row[key], 1) for key in ("found", "hidden_found", "ghosts")]
-        error = row["median_error_m"]
-        off = "–" if error is None else f"{error:.{2 if error < 10.0 else 1}f} m"
-        rows.append([name, *scores, *counts, off, _number(row["bytes_for_pose"] or 0.0, 0)])
+        rows.append([name, *scores, *counts, _length(row["median_error_m"]), _number(row["bytes_for_pose"] or 0.0, 0)])
     return header, rows
 
 
@@ -165,7 +163,7 @@ def _table_notes(summary: dict[str, Any]) -> list[str]:
         "vehicle by that much.",
         f"Noisy GPS: Gaussian, standard deviation {NOISE.position:g} m in x and in y and {NOISE.yaw:g}° in heading, "
         "for every car anew in every frame. Under attack: the others claim to be where the ego is.",
-        "Off by: how far the pose is from the true one, median over frames and cars, of the poses that were used. "
+        "Off: how far the pose is from the true one, median over frames and cars, of the poses that were used. "
         f"CoBEVGlue used {100.0 * used:.0f} % of them, and refused the rest.",
         "Bytes: what a car that helps sends for its pose, a frame; the features come on top, as said below.",
     ]
@@ -195,6 +193,12 @@ def _limits(summary: dict[str, Any]) -> str:
         f"\n\nTime for a frame of {summary['agents']} cars, the median here: {times or 'not measured'}. On the road, "
         "every car has its own computer for its perception."
     )
+
+
+def _length(metres: float | None) -> str:
+    if metres is None:
+        return "–"
+    return f"{100.0 * metres:.0f} cm" if metres < 1.0 else f"{metres:.{1 if metres < 10.0 else 0}f} m"
 
 
 def _number(value: float | None, digits: int) -> str:
