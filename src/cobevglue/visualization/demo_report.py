@@ -189,9 +189,10 @@ def _limits(summary: dict[str, Any]) -> str:
         f"Traffic and LiDARs are simulated, on a road network ({NETWORK}) that nothing was trained on. Detector, "
         "tracker, alignment and fusion are those that run on real clouds. CoBEVGlue gets clouds only: no pose, no map, "
         "no roads. The junction is a busy one, and the ego is the car from which most driving vehicles are hidden, so "
-        "that there is something to gain; `cobevglue reproduce` measures on drives that nobody chose."
-        f"\n\nTime for a frame of {summary['agents']} cars, the median here: {times or 'not measured'}. On the road, "
-        "every car has its own computer for its perception."
+        "that there is something to gain; cobevglue reproduce measures on drives that nobody chose."
+        f"\n\nTime for a frame of {summary['agents']} cars, the median here: {times or 'not measured'}, with the other "
+        "rows and the simulation running beside it; cobevglue bench times each step by itself. On the road, every car "
+        "has its own computer for its perception."
     )
 
 
