@@ -47,7 +47,11 @@ def test_csv_has_all_digits_and_empty_cells_for_what_is_missing() -> None:
         (0.00036, "0.00036"),  # a share that three decimals would hide
         (-0.004, "-0.004"),
         (0.5, "0.500"),
-        (123.456, "123.456"),
+        (0.0123, "0.012"),
+        (5e-15, "0.000"),
+        (9.8765, "9.877"),
+        (12.3456, "12.3"),
+        (123.456, "123"),
         (4321.9, "4,322"),
         (math.inf, "inf"),
         (math.nan, "–"),

@@ -44,7 +44,7 @@ class Table:
                 raise ValueError(f"{self.name}: row {number} has {len(row)} cells, not {len(self.columns)}")
 
     def text_rows(self) -> list[list[str]]:
-        """The cells as people read them: numbers in three decimals, a dash for what is missing."""
+        """The cells as people read them: measured numbers in about three digits, a dash for what is missing."""
         return [[_text(cell) for cell in row] for row in self.rows]
 
     def to_markdown(self) -> str:
@@ -80,6 +80,6 @@ def _text(cell: Cell) -> str:
         return _MISSING
     if isinstance(cell, int):
         return f"{cell:,}"
-    if cell != 0.0 and abs(cell) < 0.01:
+    if 1e-9 < abs(cell) < 0.01:  # such as a share of bytes; what is even less is rounding
         return f"{cell:.2g}"
-    return f"{cell:,.0f}" if abs(cell) >= 1000.0 else f"{cell:.3f}"
+    return f"{cell:,.0f}" if abs(cell) >= 100.0 else f"{cell:.1f}" if abs(cell) >= 10.0 else f"{cell:.3f}"

@@ -6,7 +6,7 @@ from cobevglue.experiments import paper
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import IOUS, Results, pose_quality
 from cobevglue.experiments.table import Cell, Table
-from cobevglue.experiments.tables.scope import Experiment, Scope, as_is
+from cobevglue.experiments.tables.scope import PAPERS, Experiment, Scope, as_is
 
 __all__ = ["ABLATION"]
 
@@ -36,7 +36,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     published = paper.ABLATION.get(dataset)
     columns = ["matching", "geometry", "tracking"]
     for iou in IOUS:
-        columns += [f"AP@{iou:g}"] + (["paper"] if published else [])
+        columns += [f"AP@{iou:g}"] + ([f"paper AP@{iou:g}"] if published else [])
     columns += ["refused", "wrong of accepted"]
     rows = []
     for (variant, geometry, tracking), condition in _rows(scope).items():
@@ -50,11 +50,12 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     alone: list[Cell] = ["no collaboration", "", ""]
     for iou in IOUS:
         alone += [results.ap(as_is("none"), iou)] + ([None] if published else [])
-    notes = (
+    notes: tuple[str, ...] = (
         "As printed: `BEVGlueConfig.paper()`, which accepts whatever it finds; ours: the default, which refuses what "
         "is doubtful. Without geometry every pair of boxes of similar size counts as common.",
         "The paper's first row is as good as no collaboration: its failed matches must have been dropped.",
     )
+    notes += PAPERS if published else ()
     return [Table("ablation", "What the matching looks at", columns, [*rows, [*alone, None, None]], notes)]
 
 

@@ -6,7 +6,7 @@ from cobevglue.experiments import paper
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.table import Cell, Table
-from cobevglue.experiments.tables.scope import Experiment, Scope, as_is, attacked, method_title
+from cobevglue.experiments.tables.scope import PAPERS, Experiment, Scope, as_is, attacked, method_title
 
 __all__ = ["ATTACK_TABLE"]
 
@@ -22,7 +22,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     published = paper.ATTACK.get(dataset, {})
     columns = ["method"]
     for quantity in ("AP@0.5 without", "AP@0.5 with", "AP@0.7 without", "AP@0.7 with", "added bytes [%]"):
-        columns += [quantity] + (["paper"] if published else [])
+        columns += [quantity] + ([f"paper {quantity}"] if published else [])
     rows = []
     for name in (*scope.trusting, *scope.localised):
         usual = attacked(name, "given" if name in scope.localised else None)
@@ -40,12 +40,13 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     for value in (results.ap(alone, 0.5), None, results.ap(alone, 0.7), None, None):
         last += [value] + ([None] if published else [])
     rows.append(last)
-    notes = (
+    notes: tuple[str, ...] = (
         "Without: poses from where the method's own paper has them; CoBEVGlue's fusion trusts the claims here. With: "
         "poses from BEVGlue, which sees no claim.",
         "Added bytes: what BEVGlue sends, as a share of what the method sends for fusion, both as encoded. Features "
         "travel in 16 bits.",
     )
+    notes += PAPERS if published else ()
     return [Table("attack", "Same-place attack, without and with BEVGlue", columns, rows, notes)]
 
 

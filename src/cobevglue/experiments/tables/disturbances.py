@@ -61,7 +61,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
             rows.append([title, *cells])
         rows.append(["no collaboration", results.ap(as_is("none"), iou, every), *[None] * (len(_rows(scope)) - 1)])
         title = f"AP@{iou:g} under further disturbances"
-        notes = (f"On every {every}th frame." if every > 1 else "On all frames.",)
+        notes = (f"On one frame in {every}; CoBEVGlue, who remembers, is run on those between, too.",)
         tables.append(Table(f"disturbances_ap{iou:g}", title, ("what goes wrong", *_rows(scope)), rows, notes))
     (ours,) = scope.localised
     rows = []
@@ -76,8 +76,9 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
 FURTHER = Experiment(
     "disturbances",
     "Further disturbances",
-    "Replayed and constantly wrong localisation, boxes that a collaborator makes up, lost messages and late ones. A "
-    "pose of a late message counts as right where it is that of the time when the message was sent.",
+    "Replayed and constantly wrong localisation, boxes that a collaborator makes up (and adds to those it "
+    "tells, not to its features), lost messages and late ones. A pose of a late message counts as right where "
+    "it is that of the time when the message was sent.",
     _conditions,
     _tables,
 )

@@ -6,7 +6,7 @@ from cobevglue.experiments import paper
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.table import Cell, Table
-from cobevglue.experiments.tables.scope import Experiment, Scope, aligner_title, as_is, level_name, method_title
+from cobevglue.experiments.tables.scope import PAPERS, Experiment, Scope, aligner_title, as_is, level_name, method_title
 from cobevglue.fusion import FUSION_METHODS
 
 __all__ = ["NOISE", "noise_curves"]
@@ -37,7 +37,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     published = paper.NOISE.get(dataset)
     columns = ["method", "poses from"]
     for level in scope.levels:
-        columns += [level_name(level)] + (["paper"] if published else [])
+        columns += [level_name(level)] + ([f"paper {level_name(level)}"] if published else [])
     tables = []
     for iou in (0.5, 0.7):
         rows = []
@@ -48,10 +48,11 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
                 if published:
                     row.append(_published(published, name, iou, level))
             rows.append(row)
-        notes = (
+        notes: tuple[str, ...] = (
             "Columns: standard deviation of x and y in metres / of yaw in degrees, on the poses of all agents.",
             "CoBEVGlue is really run at every level; no collaboration and true poses cannot differ and are run once.",
         )
+        notes += PAPERS if published else ()
         tables.append(Table(f"noise_ap{iou:g}", f"AP@{iou:g} under localisation noise", columns, rows, notes))
     return tables
 

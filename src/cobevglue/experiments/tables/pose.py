@@ -50,7 +50,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         if heard:
             groups.append([group, *_cells(heard)])
     notes = ("Wrong: off by more than 3 m or 3°. A refusal is neither right nor wrong, and counts as no success.",)
-    seen = ("Co-visible: objects of the truth that a tracked box of either agent overlaps.",)
+    seen = ("Co-visible: objects of the truth that tracked boxes of both agents overlap.",)
     return [
         Table("poses", "Poses by source and localisation noise", columns, rows, notes),
         Table(

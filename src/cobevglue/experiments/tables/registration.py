@@ -58,6 +58,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
                 results.alignment_bytes(condition, every) if sent else None,
                 results.ap(condition, 0.5, every),
                 results.ap(condition, 0.7, every),
+                quality.refused if sent else None,
                 quality.success_1 if sent else None,
                 quality.success_3 if sent else None,
                 milliseconds,
@@ -69,12 +70,14 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         "sent [bytes]",
         "AP@0.5",
         "AP@0.7",
+        "refused",
         "within 1 m, 1°",
         "within 3 m, 3°",
         "time [ms]",
     )
     notes = (
-        f"CoBEVGlue's fusion on every {every}th frame; bytes are of one collaborator in one frame, for alignment only.",
+        f"CoBEVGlue's fusion on one frame in {every}; bytes are of one collaborator in one frame, for alignment only.",
+        "What a cloud has after thinning out may be less than the budget.",
         "Initial pose: ICP starts from claimed poses with this noise, in metres and degrees on every agent; the others "
         "need none.",
     )
