@@ -50,7 +50,7 @@ class PoseMatching(nn.Module):
         self.window, self.patch = window, patch
         shifts = (2 * window + 1) ** 2
         self.embedding = nn.Conv2d(channels, embedding, 1, bias=False)
-        nn.init.orthogonal_(self.embedding.weight)
+        nn.init.orthogonal_(self.embedding.weight, gain=0.2)  # scaled afterwards: small weights learn faster
         self.log_temperature = nn.Parameter(torch.tensor(math.log(_TEMPERATURE)))
         self.confidence = nn.Sequential(nn.Conv2d(shifts, 32, 1), nn.ReLU(), nn.Conv2d(32, 1, 1))
         self.agreement = nn.Sequential(nn.Conv2d(shifts, 16, 1), nn.ReLU())
@@ -69,7 +69,8 @@ class PoseMatching(nn.Module):
             (P, 3) x, y [m] and yaw [rad], in the axes of the first, and (P,) logits of being in place.
         """
         correlations, inside = self._correlate(first.expand_as(second), second, covered)
-        likely = (correlations * self.log_temperature.exp()).softmax(dim=1)
+        correlations = correlations * self.log_temperature.exp()
+        likely = correlations.softmax(dim=1)
         clear = likely.square().sum(dim=1, keepdim=True) - 1.0 / likely.shape[1]
         weight = clear * inside * self.confidence(correlations).sigmoid()
         shifts, cells = self._in_metres(second)
