@@ -43,7 +43,7 @@ class V2VNetRobustPoses(GroupAligner):
 
     needs = frozenset({"pose", "features"})
 
-    def __init__(self, fusion: V2VNetRobust | None = None, iterations: int = 2) -> None:
+    def __init__(self, fusion: V2VNetRobust | None = None, iterations: int = 3) -> None:
         self._fusion = fusion
         self._iterations = iterations
 

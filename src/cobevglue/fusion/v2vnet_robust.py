@@ -65,7 +65,7 @@ class V2VNetRobust(V2VNet):
 
     @torch.inference_mode()
     def correct(
-        self, features: Sequence[Sequence[Tensor]], believed: Mapping[tuple[int, int], SE2], iterations: int = 2
+        self, features: Sequence[Sequence[Tensor]], believed: Mapping[tuple[int, int], SE2], iterations: int = 3
     ) -> dict[tuple[int, int], tuple[SE2, float]]:
         """Relative poses of pairs of agents, corrected.
 
