@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 from torch import nn
 
 from cobevglue.training import OptimisationConfig
-from cobevglue.training.optimisation import MeanWeights, learning_rate, make_optimizer
+from cobevglue.training.optimisation import MeanWeights, autocast, learning_rate, make_optimizer
 
 CONFIG = OptimisationConfig(learning_rate=1.0, start=0.1, warm_up=0.2, end=0.01)
 
@@ -33,6 +35,21 @@ def test_the_rate_has_one_top() -> None:
 @pytest.mark.parametrize("steps", [1, 2])
 def test_a_run_of_a_step_or_two_has_a_rate(steps: int) -> None:
     assert all(0.0 < learning_rate(step, steps, CONFIG) <= 1.0 for step in range(steps))
+
+
+@pytest.mark.parametrize(
+    ("precision", "kind"),
+    [
+        ("auto", torch.float32),  # half precision is slow on most CPUs
+        ("float32", torch.float32),
+        ("bfloat16", torch.bfloat16),
+    ],
+)
+def test_products_on_a_cpu_have_the_precision_asked_for(
+    precision: Literal["auto", "float32", "bfloat16"], kind: torch.dtype
+) -> None:
+    with autocast(OptimisationConfig(precision=precision), torch.device("cpu")):
+        assert nn.Linear(2, 2)(torch.ones(1, 2)).dtype == kind
 
 
 def test_biases_and_norms_are_not_decayed() -> None:

@@ -23,7 +23,7 @@ from cobevglue.training.checkpoint import (
     save_state,
 )
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
-from cobevglue.training.optimisation import MeanWeights, learning_rate, make_optimizer
+from cobevglue.training.optimisation import MeanWeights, autocast, learning_rate, make_optimizer
 from cobevglue.training.processes import Processes, process_group
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 from cobevglue.training.samples import EpisodeSource
@@ -226,7 +226,7 @@ class _Run:
             rate = learning_rate(step, self.steps, optimisation)
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
-            with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+            with autocast(optimisation, device):
                 output = self.net(batch.clouds(device))
             terms = self.loss(output, batch.targets.to(device))
             self.optimizer.zero_grad(set_to_none=True)

@@ -25,7 +25,7 @@ from cobevglue.training.checkpoint import RunState, differing_keys, load_state, 
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
-from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, learning_rate, make_optimizer
+from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, autocast, learning_rate, make_optimizer
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 
 __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
@@ -222,7 +222,8 @@ def _train_epoch(
         for group in optimizer.param_groups:
             group["lr"] = rate
         targets = collate_targets([item.targets for item in items], anchors)
-        terms = model.loss([item.sample for item in items], targets, loss)
+        with autocast(optimisation, torch.device("cpu")):
+            terms = model.loss([item.sample for item in items], targets, loss)
         optimizer.zero_grad(set_to_none=True)
         terms["total"].backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(model.parameters(), optimisation.clip)

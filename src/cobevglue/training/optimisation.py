@@ -1,10 +1,10 @@
-"""The optimiser's settings, the learning rate over the steps, and the running mean of the weights."""
+"""The optimiser's settings, its precision, the learning rate over the steps, and the running mean of the weights."""
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
 import torch
 from pydantic import Field
@@ -12,7 +12,7 @@ from torch import nn
 
 from cobevglue.settings import Settings
 
-__all__ = ["MeanWeights", "OptimisationConfig", "learning_rate", "make_optimizer"]
+__all__ = ["MeanWeights", "OptimisationConfig", "autocast", "learning_rate", "make_optimizer"]
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -35,6 +35,8 @@ class OptimisationConfig(Settings):
         clip: largest norm of the gradient; a longer one is shortened.
         mean_decay: the model that is validated and saved is a running mean of the weights that forgets them by this
             factor a step (faster in the first steps); 0 takes the last weights.
+        precision: of convolutions and products; weights, norms and the loss are float32 always. "auto" is bfloat16 on
+            CUDA and float32 elsewhere. On a CPU that has AVX512-BF16 or AMX, "bfloat16" takes half the time.
     """
 
     epochs: Annotated[int, Field(ge=1)] = 30
@@ -47,6 +49,13 @@ class OptimisationConfig(Settings):
     weight_decay: Annotated[float, Field(ge=0.0)] = 0.01
     clip: _Positive = 10.0
     mean_decay: _Share = 0.999
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+
+
+def autocast(config: OptimisationConfig, device: torch.device) -> torch.autocast:
+    """The context for the forward pass in the precision that `config` asks for."""
+    wanted = config.precision == "bfloat16" or (config.precision == "auto" and device.type == "cuda")
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
 
 
 def learning_rate(step: int, steps: int, config: OptimisationConfig) -> float:

@@ -9,6 +9,7 @@ from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.perception import DetectionLoss, PointPillars
 from cobevglue.training.batches import Batch, Batches
 from cobevglue.training.config import TrainDetectorConfig
+from cobevglue.training.optimisation import autocast
 from cobevglue.training.processes import Processes
 from cobevglue.training.samples import EpisodeSource
 from cobevglue.training.stream import FixedStream
@@ -38,7 +39,7 @@ class Validation:
         with torch.inference_mode():
             for batch in self._batches:
                 clouds = batch.clouds(device)
-                with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+                with autocast(self._config.optimisation, device):
                     output = model(clouds)
                 for name, value in self._loss(output, batch.targets.to(device))._asdict().items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(clouds)
