@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +24,8 @@ from cobevglue.perception import (
 )
 from cobevglue.se2 import SE2
 from cobevglue.typing import Float32Array
+
+Method = TypeVar("Method", bound=IntermediateFusion)
 
 SMALL = PointPillarsConfig(
     x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 12),
@@ -48,6 +51,13 @@ def small_detector(seed: int = 0) -> PointPillars:
         norm.momentum = 0.01
     detector.detection = detector.detection.model_copy(update={"score_threshold": 0.0, "max_detections": 20})
     return detector.eval()
+
+
+def seeded(kind: type[Method], detector: PointPillars, seed: int = 1) -> Method:
+    """A method with random weights, in evaluation mode."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return kind(detector).eval()
 
 
 def cloud(seed: int, count: int = 600) -> Float32Array:

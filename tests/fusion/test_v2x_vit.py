@@ -13,7 +13,6 @@ from torch import nn
 from cobevglue.fusion import fusion_class
 from cobevglue.fusion.v2x_vit import V2XViT, V2XViTBlock
 from cobevglue.fusion.v2x_vit_attention import AgentAttention, MultiScaleWindowAttention, WindowAttention
-from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray
 
 from . import checks
@@ -129,36 +128,9 @@ def test_asking_for_the_ego_alone_gives_the_same() -> None:
 
 
 def method_with_weights(seed: int = 1) -> V2XViT:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        method = V2XViT(DETECTOR).eval()
-        nn.init.normal_(method.up.weight, std=0.5)
+    method = checks.seeded(V2XViT, DETECTOR, seed)
+    method.up.weight.data.mul_(500.0)  # at first they are close to 0
     return method
-
-
-def test_before_training_it_is_the_detector() -> None:
-    seen = checks.view(DETECTOR, 0)
-    with torch.inference_mode():
-        output = V2XViT(DETECTOR).eval()([checks.sample_of([seen])])
-        expected = DETECTOR.decode_features([m[None] for m in seen.features])
-    assert expected.logits.std() > 0.2
-    torch.testing.assert_close(output.logits, expected.logits, atol=0.02, rtol=0.0)
-
-
-def test_a_message_is_a_quarter_of_the_cells_with_twice_the_channels() -> None:
-    message = method_with_weights().message(checks.view(DETECTOR, 0))
-    assert {name: values.shape for name, values in message.items()} == {"map0": (16, 8, 16)}
-    assert message["map0"].dtype == np.float16
-
-
-def test_cells_of_the_map_at_stride_4_are_where_warping_takes_them_to_be() -> None:
-    """A map at stride 2 turned by 180 degrees, then halved, is the halved one turned."""
-    with torch.inference_mode():
-        down = method_with_weights().down
-        kernel = next(down.parameters())
-        kernel.copy_(kernel + kernel.flip(2, 3))  # turning leaves it as it is
-        x = torch.randn(1, 8, 16, 32, generator=torch.Generator().manual_seed(0))
-        torch.testing.assert_close(down(x.flip(2, 3)), down(x).flip(2, 3))
 
 
 def test_who_does_not_reach_the_ego_s_surroundings_changes_nothing() -> None:
@@ -166,19 +138,6 @@ def test_who_does_not_reach_the_ego_s_surroundings_changes_nothing() -> None:
     method = method_with_weights()
     far = checks.sent(method, other, checks.FAR)
     checks.assert_same_boxes(method.fuse(ego, [far]), method.fuse(ego, []), atol=1e-5)
-
-
-def test_messages_say_what_training_sees() -> None:
-    ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
-    method = method_with_weights()
-    with torch.inference_mode():
-        seen = method.fused([checks.sample_of([ego, other])])
-        received = method.received_maps(checks.sent(method, other, checks.POSES[0]).content)
-        own = method.share([m[None] for m in ego.features])
-        maps = [torch.cat([mine, theirs[None]]) for mine, theirs in zip(own, received, strict=True)]
-        over_the_wire = method._fuse(maps, [SE2(), checks.POSES[0]])
-    for there, here in zip(over_the_wire, seen, strict=True):
-        torch.testing.assert_close(there, here[0], atol=0.01, rtol=0.0)
 
 
 def test_it_listens_in_any_order() -> None:

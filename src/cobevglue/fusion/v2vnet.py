@@ -8,22 +8,19 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from cobevglue.fusion.intermediate import SingleMapFusion
-from cobevglue.perception import HeadOutput, PointPillars
-from cobevglue.perception.backbone import conv_norm
+from cobevglue.fusion.coarse_map import CoarseMapFusion
+from cobevglue.perception import PointPillars
 
 __all__ = ["V2VNet"]
 
 
-class V2VNet(SingleMapFusion):
+class V2VNet(CoarseMapFusion):
     """Cross-vehicle aggregation by a graph neural network (section 3.2 of the paper).
 
     Every agent is a node, its map is the node's state. In each round every node gets a message from every node, itself
     included: a convolution of both states, 0 where the sender's map does not reach. The maximum over the messages goes
     into a gated recurrent unit whose hidden state is the node's map. After the last round, a linear layer in each
     cell.
-
-    One map is shared, at half the resolution of the head's and with twice its channels.
 
     It differs from the paper in that all states are in the ego's frame from the start, as only the ego's is decoded in
     the end; the paper warps them to the receiver's frame in every round. What a convolution does to the border of a map
@@ -39,26 +36,11 @@ class V2VNet(SingleMapFusion):
 
     def __init__(self, detector: PointPillars) -> None:
         super().__init__(detector)
-        narrow = self.config.shrink_channels
-        wide = 2 * narrow
-        self.down = conv_norm(narrow, wide, 3, stride=2)
+        wide, narrow = self.channels, self.channels // 2
         self.sender = nn.Conv2d(wide, narrow, 3, padding=1)
         self.receiver = nn.Conv2d(wide, narrow, 1, bias=False)
         self.update = GatedUpdate(wide, narrow)
         self.last = nn.Sequential(nn.Conv2d(wide, wide, 1), nn.ReLU(inplace=True))
-        self.up = nn.Sequential(
-            nn.ConvTranspose2d(wide, narrow, 2, stride=2, bias=False),
-            nn.BatchNorm2d(narrow, eps=1e-3, momentum=0.01),
-            nn.ReLU(inplace=True),
-        )
-
-    def turned_channels(self) -> Sequence[int]:
-        """Of the map at stride 4."""
-        return [2 * self.config.shrink_channels]
-
-    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
-        """The neck's map, at half its resolution: stride 4."""
-        return [self.down(self.neck(features))]
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
         """The ego's state after all rounds of messages."""
@@ -81,11 +63,6 @@ class V2VNet(SingleMapFusion):
             states = self.update(receivers, heard)
         last: Tensor = self.last(states)[0]
         return last
-
-    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
-        """The head, after a transposed convolution back to its resolution."""
-        output: HeadOutput = self.head(self.up(maps[0]))
-        return output
 
 
 class GatedUpdate(nn.Module):

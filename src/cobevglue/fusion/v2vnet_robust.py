@@ -55,7 +55,7 @@ class V2VNetRobust(V2VNet):
 
     def __init__(self, detector: PointPillars) -> None:
         super().__init__(detector)
-        self.matching = PoseMatching(self.config, 2 * self.config.shrink_channels)
+        self.matching = PoseMatching(self.config, self.channels)
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
         """The ego's state after all rounds of weighted messages."""
@@ -77,7 +77,7 @@ class V2VNetRobust(V2VNet):
         Returns:
             For each pair its pose, and the share of the first's map that the second's covers.
         """
-        (maps,) = self.share([torch.stack(scale) for scale in zip(*features, strict=True)])
+        maps, _ = self.share([torch.stack(scale) for scale in zip(*features, strict=True)])
         found = {}
         for (first, second), pose in believed.items():
             one, other = maps[first : first + 1], maps[second : second + 1]
@@ -90,11 +90,12 @@ class V2VNetRobust(V2VNet):
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
         """The detector's loss, that of the corrections ("pose") and that of the messages' weights ("attention")."""
         agents = [seen for sample in samples for seen in sample.seen]
-        (shared,) = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
-        maps = torch.split(shared, [len(sample.seen) for sample in samples])
+        shared = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
+        counts = [len(sample.seen) for sample in samples]
+        maps, own = (torch.split(m, counts) for m in shared)
         parts = [self._sample_loss(maps[number], sample, number) for number, sample in enumerate(samples)]
         fused, pose, attention = (torch.stack(part) for part in zip(*parts, strict=True))
-        terms = loss(self.decode_maps([fused]), targets)._asdict()
+        terms = loss(self.decode_maps([fused, torch.stack([m[0] for m in own])]), targets)._asdict()
         looks = 2 * max(len(agents) - len(samples), 1)
         terms["pose"], terms["attention"] = pose.sum() / looks, attention.sum() / looks
         terms["total"] = terms["total"] + self.pose_weight * terms["pose"] + self.attention_weight * terms["attention"]

@@ -16,12 +16,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from cobevglue.fusion.intermediate import IntermediateFusion
+from cobevglue.fusion.coarse_map import CoarseMapFusion
 from cobevglue.fusion.v2x_vit_attention import AgentAttention, MultiScaleWindowAttention
-from cobevglue.messages import Arrays
-from cobevglue.perception import PerceptionOutput, PointPillars
-from cobevglue.perception.head import HeadOutput
-from cobevglue.se2 import SE2
+from cobevglue.perception import PointPillars
 
 __all__ = ["V2XViT", "V2XViTBlock"]
 
@@ -30,50 +27,15 @@ _WINDOWS = (4, 8)
 """Sides of the windows [cells]; a cell is 1.6 m with the compact detector, as in the paper."""
 
 
-class V2XViT(IntermediateFusion):
-    """A transformer over agents and places, on a map at stride 4 with twice the channels of the neck's.
-
-    The paper's head reads that map. Ours works at stride 2, where the ego has its own map: what the transformer makes
-    of all agents' is brought back to stride 2 and added to it. (Without the ego's map there, training for minutes ended
-    at an AP 0.5 / 0.7 of 0.873 / 0.616 on the simulated validation split, below all others.) It starts as the detector.
-
-    Both changes of scale are by windows of 2 x 2 cells: a cell's centre stays where warping takes it to be.
-    """
+class V2XViT(CoarseMapFusion):
+    """A transformer over agents and places, on a map at stride 4."""
 
     training_noise = (0.2, 0.2)
 
     def __init__(self, detector: PointPillars) -> None:
         super().__init__(detector)
-        shrunk = self.config.shrink_channels
-        channels = 2 * shrunk
-        self.down = nn.Sequential(nn.Conv2d(shrunk, channels, 2, 2), nn.ReLU(inplace=True))
-        self.blocks = nn.ModuleList(V2XViTBlock(channels, _WINDOWS) for _ in range(_BLOCKS))
-        self.up = nn.ConvTranspose2d(channels, shrunk, 2, 2, bias=False)
-        nn.init.normal_(self.up.weight, std=0.001)
+        self.blocks = nn.ModuleList(V2XViTBlock(self.channels, _WINDOWS) for _ in range(_BLOCKS))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    def turned_channels(self) -> Sequence[int]:
-        """Of the map at stride 4."""
-        return [2 * self.config.shrink_channels]
-
-    def share(self, features: Sequence[Tensor]) -> list[Tensor]:
-        """The neck's map at stride 4, which is sent, and at stride 2, which is not."""
-        own = self.neck(features)
-        return [self.down(own), own]
-
-    @torch.inference_mode()
-    def message(self, seen: PerceptionOutput) -> Arrays:
-        """The map at stride 4 (C, H, W) in float16."""
-        return {"map0": super().message(seen)["map0"]}
-
-    def received_maps(self, content: Arrays) -> list[Tensor]:
-        """The map at stride 4, and zeros for the one that was not sent."""
-        (shared,) = super().received_maps(content)
-        rows, columns, _ = self.config.head_shape
-        return [shared, shared.new_zeros(self.config.shrink_channels, rows, columns)]
-
-    def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
-        return [*super()._fuse(maps[:1], ego_SE2_agent), maps[1][0]]
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
         """The ego's map at stride 4 after all blocks."""
@@ -82,11 +44,6 @@ class V2XViT(IntermediateFusion):
         for number, block in enumerate(self.blocks, start=1):
             x = block(x, present, len(x) if number < _BLOCKS else 1)
         return [x[0].permute(2, 0, 1)]
-
-    def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
-        """The fused map back to stride 2, added to the ego's own there, and the head."""
-        output: HeadOutput = self.head(torch.relu(maps[1] + self.up(maps[0])))
-        return output
 
 
 class V2XViTBlock(nn.Module):
