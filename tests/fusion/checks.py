@@ -122,7 +122,10 @@ def check_all_parameters_learn(method: IntermediateFusion, detector: PointPillar
         assert isinstance(turn, Turn)
         torch.nn.init.normal_(turn.last.weight, std=0.1)
     method.train()
-    terms = method.loss(samples, collate_targets(targets, len(method.anchors)), DetectionLoss(method.config))
+    batch, loss = collate_targets(targets, len(method.anchors)), DetectionLoss(method.config)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        assert torch.isfinite(method.loss(samples, batch, loss)["total"])  # no precisions are mixed up
+    terms = method.loss(samples, batch, loss)
     terms["total"].backward()  # type: ignore[no-untyped-call]
     assert all(torch.isfinite(term) for term in terms.values())
     idle = [name for name, p in method.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from cobevglue.boxes import covers_origin
 from cobevglue.fusion.cobevglue import MaxFusion
 from cobevglue.fusion.f_cooper import FCooper
 from cobevglue.perception import PointPillars, PointPillarsConfig
@@ -72,6 +73,19 @@ def test_frames_come_back_as_the_detector_saw_them(detector_file: Path, features
         np.testing.assert_allclose(view.detections.bev, detector.detect(view.points).bev, atol=1e-6)
     assert len(frame.truth) == len(frame.ignored)
     assert not frame.ignored.all()
+
+
+def test_any_agent_can_be_the_ego(features: Path) -> None:
+    frame = FusionFrames(features / "train")[2]
+    turned = frame.with_ego(1)
+    assert [id(view) for view in turned.seen] == [id(frame.seen[i]) for i in (1, 0, 2)]
+    before, after = (
+        one.truth.center @ one.world_SE3_agent[0][:3, :3].T + one.world_SE3_agent[0][:3, 3] for one in (frame, turned)
+    )
+    np.testing.assert_allclose(after, before, atol=1e-6)  # in the world
+    assert turned.ignored.sum() >= frame.ignored.sum()
+    assert turned.ignored[covers_origin(turned.truth)].all()
+    assert turned.early_features is None  # that of the other ego would be wrong
 
 
 def test_features_that_were_interrupted_are_completed_and_nothing_is_made_twice(

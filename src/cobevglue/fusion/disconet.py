@@ -21,6 +21,8 @@ class EarlyTeacher(MultiScaleFusion):
     It is trained, saved and loaded as any method is, but is none: what is asked for in use it does not have.
     """
 
+    learns_from_merged_clouds = True
+
     def turned_channels(self) -> Sequence[int]:
         """None: all points are in the ego's frame."""
         return []
@@ -67,6 +69,7 @@ class DiscoNet(SingleMapFusion):
 
     teacher: EarlyTeacher | None
     distillation_weight = 10.0
+    learns_from_merged_clouds = True
 
     def __init__(self, detector: PointPillars) -> None:
         super().__init__(detector)

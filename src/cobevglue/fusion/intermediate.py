@@ -72,9 +72,11 @@ class IntermediateFusion(FusionMethod, nn.Module):
         detection: how boxes are chosen, the detector's own settings at first.
         training_noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose in training, as the
             method's paper has it.
+        learns_from_merged_clouds: whether `loss` looks at `FusionSample.early_features`.
     """
 
     training_noise: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    learns_from_merged_clouds: ClassVar[bool] = False
 
     def __init__(self, detector: PointPillars) -> None:
         nn.Module.__init__(self)

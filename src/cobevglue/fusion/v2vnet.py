@@ -78,4 +78,4 @@ class GatedUpdate(nn.Module):
         gates: Tensor = self.gates(torch.cat([state, heard], dim=1)).sigmoid()
         change, keep = gates.chunk(2, dim=1)
         candidate: Tensor = self.candidate(torch.cat([keep * state, heard], dim=1)).tanh()
-        return torch.lerp(state, candidate, change)
+        return state + change * (candidate - state)

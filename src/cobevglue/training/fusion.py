@@ -88,7 +88,11 @@ class _Item:
 
 
 class _Samples(Dataset[_Item]):
-    """The samples of one epoch, made ready: frames in a new order, with poses as the ego believes them."""
+    """The samples of one epoch, made ready: frames in a new order, with poses as the ego believes them.
+
+    Any agent of a frame may be the ego. Merged clouds are known for one of them only: where they are learnt from, it is
+    that one.
+    """
 
     def __init__(
         self,
@@ -96,11 +100,12 @@ class _Samples(Dataset[_Item]):
         order: Sequence[int],
         noise: tuple[float, float],
         alone: float,
+        merged: bool,
         seed: tuple[int, ...],
         anchors: AnchorGrid,
     ) -> None:
         self._frames, self._order, self._noise, self._alone = frames, order, noise, alone
-        self._seed, self._anchors = seed, anchors
+        self._merged, self._seed, self._anchors = merged, seed, anchors
 
     def __len__(self) -> int:
         return len(self._order)
@@ -108,6 +113,8 @@ class _Samples(Dataset[_Item]):
     def __getitem__(self, index: int) -> _Item:
         rng = np.random.default_rng([*self._seed, index])
         frame = self._frames[self._order[index]]
+        ego = int(rng.integers(len(frame.seen)))
+        frame = frame.with_ego(0 if self._merged else ego)
         agents = 1 if rng.random() < self._alone else len(frame.seen)
         return _Item(
             _sample(frame, agents, self._noise, rng),
@@ -177,7 +184,8 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
             order = np.concatenate([rng.permutation(len(frames)) for _ in range(rounds)])
             order = order[: batches * optimisation.batch_size]
             seed = (config.seed, _SAMPLE_STREAM, epoch)
-            samples = _Samples(frames, order.tolist(), noise, config.alone, seed, anchors)
+            merged = model.learns_from_merged_clouds
+            samples = _Samples(frames, order.tolist(), noise, config.alone, merged, seed, anchors)
             _train_epoch(config, samples, model, mean, loss, optimizer, epoch, log, report)
             if epoch + 1 == optimisation.epochs and len(validation):
                 metrics = _validate(mean.model, validation, report)

@@ -71,16 +71,26 @@ class FusionFrame:
     Attributes:
         seen: what each of the n agents saw, each in its own LiDAR frame.
         world_SE3_agent: (n, 4, 4) true poses.
-        early_features: the encoder's three maps of the merged cloud, in the ego's frame.
+        early_features: the encoder's three maps of the merged cloud, in the ego's frame; None where they are not known.
         truth: objects that any agent could see, in the ego's frame.
         ignored: (K,) which of them are neither to be found nor wrong to find: hardly any points, or the ego itself.
     """
 
     seen: tuple[PerceptionOutput, ...]
     world_SE3_agent: FloatArray
-    early_features: tuple[Tensor, Tensor, Tensor]
+    early_features: tuple[Tensor, Tensor, Tensor] | None
     truth: Boxes
     ignored: BoolArray
+
+    def with_ego(self, number: int) -> FusionFrame:
+        """The same frame with agent `number` as the ego; the vehicle of the ego before stays ignored."""
+        if number == 0:
+            return self
+        order = [number, *(other for other in range(len(self.seen)) if other != number)]
+        poses = self.world_SE3_agent[order]
+        truth = transform_boxes(self.truth, inverse_SE3(poses[0]) @ self.world_SE3_agent[0])
+        seen = tuple(self.seen[agent] for agent in order)
+        return FusionFrame(seen, poses, None, truth, self.ignored | covers_origin(truth))
 
 
 def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_points: int) -> FusionFrame:
