@@ -2,8 +2,8 @@
 
     python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
 
-Further files are the runs that it started from (`init_from`), the first one first; of each, commit, command and
-settings are kept. How boxes are chosen is no part of training, and is taken from `CONFIGS`.
+Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
+of each, commit, command and settings are kept. How boxes are chosen is no part of training, and is taken from `CONFIGS`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ def main() -> None:
         raise SystemExit(f"{arguments.weights}: is not of the configuration {arguments.name}")
     detector = PointPillars(config)
     detector.load_state_dict(trained.state_dict())
-    stages: list[dict[str, Any]] = [PointPillars.load(path).metadata for path in arguments.started_from]
+    stages: list[dict[str, Any]] = []
+    for path in arguments.started_from:
+        metadata = PointPillars.load(path).metadata
+        stages += metadata.get("stages", [metadata])
     WEIGHTS.mkdir(exist_ok=True)
     file = WEIGHTS / f"{arguments.name}.safetensors"
     detector.save(file, {"stages": [*stages, trained.metadata]}, half=True)

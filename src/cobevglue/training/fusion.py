@@ -69,7 +69,7 @@ class TrainFusionConfig(Settings):
     noise: tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]] | None = None
     teacher: Path | None = None
     optimisation: OptimisationConfig = OptimisationConfig(
-        epochs=2, samples_per_epoch=600, learning_rate=1e-3, warm_up=0.05, mean_decay=0.99
+        epochs=4, samples_per_epoch=1000, learning_rate=1e-3, warm_up=0.05, mean_decay=0.99
     )
     seed: Annotated[int, Field(ge=0)] = 0
     threads: Annotated[int, Field(ge=1)] = 2
