@@ -3,7 +3,8 @@
     python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
 
 Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
-of each, commit, command and settings are kept. How boxes are chosen is no part of training, and is taken from `CONFIGS`.
+of each, commit, command and settings are kept. How boxes are chosen is no part of training, and is taken from
+`CONFIGS`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -41,23 +40,6 @@ def test_alone_it_is_the_detector() -> None:
     detector = checks.small_detector()
     seen = checks.view(detector, 0)
     checks.assert_same_boxes(CoAlign(detector).eval().fuse(seen, []), seen.detections)
-
-
-def test_it_listens_in_any_order() -> None:
-    detector = checks.small_detector()
-    method = CoAlign(detector).eval()
-    checks.check_order_of_collaborators(method, detector)
-    checks.check_collaborators_matter(method, detector)
-
-
-def test_all_parameters_learn() -> None:
-    detector = checks.small_detector()
-    checks.check_all_parameters_learn(CoAlign(detector), detector)
-
-
-def test_weights_survive_saving(tmp_path: Path) -> None:
-    detector = checks.small_detector()
-    checks.check_weights_survive_saving(CoAlign(detector).eval(), CoAlign(detector), detector, tmp_path)
 
 
 def test_it_is_used_as_its_paper_does() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +19,7 @@ DETECTOR = checks.small_detector()
 
 
 def make_method(seed: int = 1) -> DiscoNet:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return DiscoNet(DETECTOR).eval()
+    return checks.seeded(DiscoNet, DETECTOR, seed)
 
 
 def make_sample(agents: int = 2) -> FusionSample:
@@ -72,22 +69,6 @@ def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
     checks.assert_same_boxes(
         method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
     )
-
-
-def test_the_order_of_collaborators_does_not_matter() -> None:
-    checks.check_order_of_collaborators(make_method(), DETECTOR)
-
-
-def test_collaborators_matter() -> None:
-    checks.check_collaborators_matter(make_method(), DETECTOR)
-
-
-def test_gradients_reach_every_weight() -> None:
-    checks.check_all_parameters_learn(make_method(), DETECTOR)
-
-
-def test_saved_weights_say_the_same(tmp_path: Path) -> None:
-    checks.check_weights_survive_saving(make_method(1), make_method(2), DETECTOR, tmp_path)
 
 
 def test_distillation_is_0_for_equal_maps_and_more_for_others() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -252,9 +251,7 @@ def test_the_second_look_learns_to_move_boxes_to_their_points() -> None:
 
 
 def method_with_weights(seed: int = 1) -> FPVRCNN:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        method = FPVRCNN(DETECTOR).eval()
+    method = checks.seeded(FPVRCNN, DETECTOR, seed)
     method.proposal_score = 0.0
     return method
 
@@ -385,20 +382,6 @@ def test_the_second_stage_needs_the_truth() -> None:
     sample = FusionSample([checks.view(DETECTOR, 0)], [SE2()], [SE2()])
     with pytest.raises(ValueError, match="truth"):
         method.loss([sample], targets_of(Boxes.empty(), method), DetectionLoss(method.config))
-
-
-def test_it_listens_in_any_order() -> None:
-    method = method_with_weights()
-    checks.check_order_of_collaborators(method, DETECTOR)
-    checks.check_collaborators_matter(method, DETECTOR)
-
-
-def test_all_parameters_learn() -> None:
-    checks.check_all_parameters_learn(method_with_weights(), DETECTOR)
-
-
-def test_weights_survive_saving(tmp_path: Path) -> None:
-    checks.check_weights_survive_saving(method_with_weights(), method_with_weights(2), DETECTOR, tmp_path)
 
 
 def test_it_is_used_as_its_paper_does() -> None:

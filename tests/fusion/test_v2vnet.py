@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -72,22 +70,6 @@ def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
     checks.assert_same_boxes(
         method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
     )
-
-
-def test_the_order_of_collaborators_does_not_matter() -> None:
-    checks.check_order_of_collaborators(make_method(), DETECTOR)
-
-
-def test_collaborators_matter() -> None:
-    checks.check_collaborators_matter(make_method(), DETECTOR)
-
-
-def test_gradients_reach_every_weight() -> None:
-    checks.check_all_parameters_learn(make_method(), DETECTOR)
-
-
-def test_saved_weights_say_the_same(tmp_path: Path) -> None:
-    checks.check_weights_survive_saving(make_method(1), make_method(2), DETECTOR, tmp_path)
 
 
 def test_it_goes_by_the_name_that_users_type() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,20 +137,6 @@ def test_who_does_not_reach_the_ego_s_surroundings_changes_nothing() -> None:
     method = method_with_weights()
     far = checks.sent(method, other, checks.FAR)
     checks.assert_same_boxes(method.fuse(ego, [far]), method.fuse(ego, []), atol=1e-5)
-
-
-def test_it_listens_in_any_order() -> None:
-    method = method_with_weights()
-    checks.check_order_of_collaborators(method, DETECTOR)
-    checks.check_collaborators_matter(method, DETECTOR)
-
-
-def test_all_parameters_learn() -> None:
-    checks.check_all_parameters_learn(method_with_weights(), DETECTOR)
-
-
-def test_weights_survive_saving(tmp_path: Path) -> None:
-    checks.check_weights_survive_saving(method_with_weights(), method_with_weights(2), DETECTOR, tmp_path)
 
 
 def test_channels_that_heads_cannot_share_are_refused() -> None:

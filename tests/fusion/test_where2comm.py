@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,9 +23,7 @@ CHANNELS = 8
 
 
 def method_with(threshold: float) -> Where2comm:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(1)
-        method = Where2comm(DETECTOR).eval()
+    method = checks.seeded(Where2comm, DETECTOR)
     method.threshold = threshold
     return method
 
@@ -176,20 +173,6 @@ def test_cells_that_the_map_does_not_have_are_refused() -> None:
         method.received_maps(message)
     with pytest.raises(ValueError, match="message"):
         method.received_maps({**message, "cells": np.zeros(0, np.uint16)})
-
-
-def test_it_listens_in_any_order() -> None:
-    method = method_with(0.0)
-    checks.check_order_of_collaborators(method, DETECTOR)
-    checks.check_collaborators_matter(method, DETECTOR)
-
-
-def test_all_parameters_learn() -> None:
-    checks.check_all_parameters_learn(method_with(0.01), DETECTOR)
-
-
-def test_weights_survive_saving(tmp_path: Path) -> None:
-    checks.check_weights_survive_saving(method_with(0.0), method_with(0.0), DETECTOR, tmp_path)
 
 
 def test_it_is_found_by_its_name() -> None:

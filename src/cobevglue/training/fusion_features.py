@@ -233,6 +233,7 @@ def _cropped(frame: Frame, agent: str, config: PointPillarsConfig) -> Float32Arr
 
 def _as_tensors(frame: FusionFrame) -> dict[str, Tensor]:
     tensors: dict[str, Any] = {"poses": frame.world_SE3_agent, "truth": _rows(frame.truth), "ignored": frame.ignored}
+    assert frame.early_features is not None
     views = {f"{i}": view.features for i, view in enumerate(frame.seen)} | {"early": frame.early_features}
     for name, maps in views.items():
         tensors |= {f"{name}.map{i}": m.half().contiguous() for i, m in enumerate(maps)}
