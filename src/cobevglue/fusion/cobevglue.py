@@ -14,11 +14,12 @@ __all__ = ["MaxFusion"]
 class MaxFusion(MultiScaleFusion):
     """Equation (1d) of CoBEVGlue: element-wise maximum at strides 2, 4 and 8. It has no weights of its own.
 
-    The paper says nothing of noise in training; ours is about as large as BEVGlue's errors are.
+    The paper says nothing of noise in training. Ours makes relative poses as wrong as BEVGlue's are on drives of the
+    simulated validation split: 0.1 m in x and y, 0.3 degrees.
     """
 
     usual_aligner = "bevglue"
-    training_noise = (0.2, 0.2)
+    training_noise = (0.07, 0.2)
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
         """The maximum over agents."""

@@ -131,27 +131,24 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
         """Warp and fuse maps (n, C, H, W) of n agents, the ego first."""
-        placed = [self.placed(m[1:], ego_SE2_agent[1:], i) for i, m in enumerate(maps)]
-        return self.fuse_maps(
-            [torch.cat([m[:1], others]) for m, (others, _) in zip(maps, placed, strict=True)],
-            [torch.cat([torch.ones_like(m[:1, :1]), covered]) for m, (_, covered) in zip(maps, placed, strict=True)],
-        )
+        placed = [self.placed(m, ego_SE2_agent, i) for i, m in enumerate(maps)]
+        return self.fuse_maps([m for m, _ in placed], [covered for _, covered in placed])
 
-    def placed(self, maps: Tensor, ego_SE2_others: Sequence[SE2], index: int) -> tuple[Tensor, Tensor]:
-        """Maps of other agents, warped to the ego's frame and turned to its directions.
+    def placed(self, maps: Tensor, ego_SE2_agent: Sequence[SE2], index: int) -> tuple[Tensor, Tensor]:
+        """Maps of agents, warped to the ego's frame and turned to its directions.
 
         Args:
             maps: (B, C, H, W) of B agents, what each shared.
-            ego_SE2_others: B poses.
+            ego_SE2_agent: B poses; the ego's own is no special case.
             index: which of the shared maps it is.
 
         Returns:
             (B, C, H, W), and how much of each cell they cover, (B, 1, H, W).
         """
-        warped = warp(maps, ego_SE2_others, self.config)
-        covered = coverage(maps, ego_SE2_others, self.config)
+        warped = warp(maps, ego_SE2_agent, self.config)
+        covered = coverage(maps, ego_SE2_agent, self.config)
         if index < len(self.turns):
-            warped = self.turns[index](warped, [pose.yaw for pose in ego_SE2_others], covered)
+            warped = self.turns[index](warped, [pose.yaw for pose in ego_SE2_agent], covered)
         return warped, covered
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:

@@ -25,7 +25,9 @@ _HARMONICS = 2
 class Turn(nn.Module):
     """Adds to a map what changes with the angle. It is our addition to all methods that share maps.
 
-    A layer whose weights are trigonometric polynomials of the angle, a ReLU, and a convolution; at first it adds 0.
+    A layer whose weights are trigonometric polynomials of the angle, a ReLU, and a convolution; at first it adds 0. The
+    ego's own map goes through it, too, at angle 0: so a frozen encoder's features can become ones that are fit to be
+    put together.
 
     Args:
         channels: C of the maps.

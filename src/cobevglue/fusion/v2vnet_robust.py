@@ -80,7 +80,8 @@ class V2VNetRobust(V2VNet):
         maps, _ = self.share([torch.stack(scale) for scale in zip(*features, strict=True)])
         found = {}
         for (first, second), pose in believed.items():
-            one, other = maps[first : first + 1], maps[second : second + 1]
+            one, _ = self.placed(maps[first : first + 1], [SE2()], 0)
+            other = maps[second : second + 1]
             for _ in range(iterations):
                 motions, _ = self._match(one, *self.placed(other, [pose], 0), [pose])
                 pose = apply_correction(pose, motions[0].tolist())
@@ -103,7 +104,7 @@ class V2VNetRobust(V2VNet):
 
     def _sample_loss(self, maps: Tensor, sample: FusionSample, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """The fused map of a sample, and the sums of the two losses over both looks at all collaborators."""
-        ego, others = maps[:1], maps[1:]
+        ego, others = self.placed(maps[:1], [SE2()], 0)[0], maps[1:]
         true = sample.true_ego_SE2_agent[1:]
         # Taking turns by the sample's number too, a single collaborator is as often strong as weak.
         noisy = [true[i] if (number + i) % 2 else pose for i, pose in enumerate(sample.ego_SE2_agent[1:])]

@@ -69,11 +69,11 @@ class TrainFusionConfig(Settings):
     noise: tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]] | None = None
     teacher: Path | None = None
     optimisation: OptimisationConfig = OptimisationConfig(
-        epochs=4, samples_per_epoch=1000, learning_rate=1e-3, warm_up=0.05, mean_decay=0.99
+        epochs=3, samples_per_epoch=1000, learning_rate=3e-3, warm_up=0.05, mean_decay=0.99
     )
     seed: Annotated[int, Field(ge=0)] = 0
     threads: Annotated[int, Field(ge=1)] = 2
-    workers: Annotated[int, Field(ge=0)] = 1
+    workers: Annotated[int, Field(ge=0)] = 0
     report_every: Annotated[float, Field(gt=0.0)] = 20.0
 
 
@@ -332,8 +332,15 @@ def _metadata(config: TrainFusionConfig, epoch: int, elapsed: float, metrics: di
     return {**provenance(), "training": training, "epoch": epoch, "seconds": round(elapsed), "metrics": known}
 
 
+_DEFAULT = TrainFusionConfig.model_fields["optimisation"].default
+_SLOWER = {"fpv-rcnn", "v2vnet-robust", "v2x-vit"}
+"""With layers that were tried at a third of the learning rate only."""
+
 FUSION_PRESETS: dict[str, TrainFusionConfig] = {
-    name: TrainFusionConfig(method=name)
+    name: TrainFusionConfig(
+        method=name,
+        optimisation=_DEFAULT.model_copy(update={"learning_rate": 1e-3} if name in _SLOWER else {}),
+    )
     for name, method in FUSION_METHODS.items()
     if issubclass(method, IntermediateFusion)
 }

@@ -1,0 +1,37 @@
+"""`cobevglue reproduce --quick` as users type it: every table of every method, on the shipped weights."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from typing import Any
+
+import pytest
+
+from cobevglue.cli import main
+from cobevglue.fusion import FUSION_METHODS
+
+Rows = dict[str, dict[str, Any]]
+
+
+def rows_of(table: dict[str, Any]) -> Rows:
+    """The rows by their first cell, each by column."""
+    return {row[0]: dict(zip(table["columns"], row, strict=True)) for row in table["rows"]}
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Rows]:
+    """By name, of a study of simulated drives."""
+    pytest.importorskip("libsumo")
+    out = tmp_path_factory.mktemp("quick")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["reproduce", "--quick", "--workers", "1", "--out", str(out), "--json"]) == 0
+    assert (out / "index.html").is_file()
+    assert (out / "report.md").is_file()
+    return {table["name"]: rows_of(table) for table in json.loads(printed.getvalue())["tables"]["simulated test"]}
+
+
+def test_every_table_is_there(tables: dict[str, Rows]) -> None:
+    assert {"noise_ap0.5", "noise_ap0.7", "attack", "registration", "ablation", "poses", "communication"} <= set(tables)
+    assert len(tables["noise_ap0.5"]) == len(FUSION_METHODS) + 2  # and its fusion on given and on true poses
