@@ -151,6 +151,7 @@ class CoBEVGlue:
         with _timed("fusion", spent):
             boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
             boxes = boxes[~covers_origin(boxes)]  # others see the ego, too
+            boxes = boxes.replace(center=boxes.center - (0.0, 0.0, seen[ego].raised))
         self._frame += 1
         return StepOutput(boxes, alignments, sent, alignment_bytes, spent)
 

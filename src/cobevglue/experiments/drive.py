@@ -101,7 +101,8 @@ def _truth(
     for name, agent in agents.items():
         agent_SE3_ego = inverse_SE3(agent.world_SE3_lidar) @ agents[ego].world_SE3_lidar
         there = transform_boxes(objects, agent_SE3_ego)
-        points += count_points(seen[name].points, there)
+        raised = there.replace(center=there.center + (0.0, 0.0, seen[name].raised))
+        points += count_points(seen[name].points, raised)
         detected[name] = _detected(there, seen[name].boxes)
     co_visible = {name: int((detected[ego] & rows).sum()) for name, rows in detected.items() if name != ego}
     seconds = Counter[str]()

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cobevglue.boxes import Boxes
+from cobevglue.perception.level import lifted, needed_raise
 from cobevglue.perception.point_pillars import PointPillars, check_points
 from cobevglue.tracking import Sort
 from cobevglue.typing import ArrayLike, Float32Array, FloatArray
@@ -20,15 +21,17 @@ __all__ = ["Perception", "PerceptionOutput"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerceptionOutput:
-    """What one agent sees in one frame, in its LiDAR's frame.
+    """What one agent sees in one frame, in its LiDAR's frame, but raised where the sensor stands unusually high or low.
 
     Attributes:
-        points: (N, 4) float32 x, y, z [m], intensity: the cloud itself.
+        points: (N, 4) float32 x, y, z [m], intensity: the cloud itself, raised.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
         boxes: detections good enough to be tracked, with `track_id`: what the agent tells others.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2] of the K `boxes`.
         detections: all detections, best first, down to the detector's own threshold.
         seconds: time spent in each stage [s].
+        raised: what was added to z [m] (`needed_raise`): 0 for a sensor on the roof of a car. Points and boxes of all
+            agents have the ground at the same height so.
     """
 
     points: Float32Array
@@ -37,6 +40,7 @@ class PerceptionOutput:
     variance: FloatArray
     detections: Boxes
     seconds: dict[str, float]
+    raised: float = 0.0
 
 
 class Perception:
@@ -72,6 +76,8 @@ class Perception:
             ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
         """
         checked = check_points(points)
+        raised = needed_raise(checked)
+        checked = lifted(checked, raised)
         seconds: dict[str, float] = {}
         with self._timed("pillars", seconds):
             image = self.detector.encode([torch.from_numpy(checked)])
@@ -86,7 +92,7 @@ class Perception:
             good = detections.score >= self.min_track_score
             tracked = self.tracker.update(detections[good], time)
         features = (first[0], second[0], third[0])
-        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds)
+        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
 
     @contextmanager
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:

@@ -22,6 +22,7 @@ from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_
 from cobevglue.perception.config import PointPillarsConfig
 from cobevglue.perception.decode import decode
 from cobevglue.perception.head import Head, HeadOutput
+from cobevglue.perception.level import lifted, needed_raise
 from cobevglue.perception.pillars import PillarEncoder, batch_clouds
 from cobevglue.typing import ArrayLike, Float32Array, FloatArray
 
@@ -98,7 +99,8 @@ class PointPillars(nn.Module):
         """The vehicles in one cloud.
 
         Args:
-            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped.
+            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped. A cloud of a sensor
+                that stands much higher or lower than on a car is looked at as if it did not (`needed_raise`).
 
         Returns:
             Boxes in the LiDAR's frame, best first, with score and label.
@@ -120,9 +122,14 @@ class PointPillars(nn.Module):
     def _detect(self, clouds: Sequence[ArrayLike]) -> list[tuple[Boxes, FloatArray]]:
         if not clouds:
             return []
-        tensors = [torch.from_numpy(check_points(points)) for points in clouds]
+        checked = [check_points(points) for points in clouds]
+        raised = [needed_raise(points) for points in checked]
         with self._evaluating():
-            return self.boxes(self(tensors))
+            found = self.boxes(self([torch.from_numpy(lifted(p, z)) for p, z in zip(checked, raised, strict=True)]))
+        return [
+            (boxes.replace(center=boxes.center - (0.0, 0.0, z)), variance)
+            for (boxes, variance), z in zip(found, raised, strict=True)
+        ]
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
         """Write settings, weights and metadata (as JSON can hold it) to one safetensors file.
