@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cobevglue import Boxes
 from cobevglue.fusion import FusionSample, Received, fusion_class
-from cobevglue.fusion.fpv_rcnn import FPVRCNN
+from cobevglue.fusion.fpv_rcnn import FPVRCNN, _Told
 from cobevglue.fusion.fpv_rcnn_keypoints import select_keypoints, spread
 from cobevglue.fusion.fpv_rcnn_proposals import decode_refinement, encode_refinement, merge_proposals
 from cobevglue.fusion.fpv_rcnn_roi import RoIHead
@@ -359,6 +359,16 @@ def test_the_loss_is_that_of_scores_and_boxes() -> None:
     assert exact["second_box"].item() < 0.05
     assert none["second_score"].item() == pytest.approx(-np.log1p(-scores).mean(), rel=0.05)
     assert none["second_box"].item() == 0.0
+
+
+def test_two_halves_of_a_bus_both_learn_from_it() -> None:
+    """Objects have identities, of which there must be one each: not so where an object stands for two proposals."""
+    method, loss = method_with_weights(), DetectionLoss(checks.SMALL)
+    halves = cars((-2.3, 0.0, 0.0, 0.9), (2.3, 0.0, 0.0, 0.8))
+    bus = Boxes([[0.0, 0.0, -1.0]], [[9.2, 1.9, 1.6]], [0.0], track_id=[7])
+    told = _Told(halves, np.zeros((0, 3), np.float32), torch.zeros(0, 32))
+    _, _, proposals, right = method._second_loss([told], bus, loss)
+    assert (proposals, right) == (2, 2)
 
 
 def test_a_score_is_to_grow_from_0_at_a_quarter_to_1_at_three_quarters_of_overlap() -> None:

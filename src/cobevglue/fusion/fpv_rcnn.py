@@ -183,7 +183,7 @@ class FPVRCNN(SingleMapFusion):
     def _second_loss(self, told: Sequence[_Told], truth: Boxes, loss: DetectionLoss) -> tuple[Tensor, ...]:
         """Sums over the proposals of one sample: of both terms, of proposals, and of those that overlap an object."""
         proposals, _, logits, refinement = self._second_look(told)
-        truth = truth[truth.size[:, 2] > 0.0]  # an unknown height cannot be learned
+        truth = truth[truth.size[:, 2] > 0.0].replace(track_id=None)  # an unknown height cannot be learned
         if not len(proposals) or not len(truth):
             zero = logits.new_zeros(())
             return F.softplus(logits).sum(), zero, zero + len(proposals), zero
