@@ -19,7 +19,7 @@ def warp(maps: Tensor, ego_SE2_others: Sequence[SE2], config: PointPillarsConfig
     """Maps of other agents, moved to where the ego has them.
 
     A cell of the result is what lies, in the other's map, where the centre of the ego's cell is: bilinear between the
-    four nearest cells, 0 outside.
+    four nearest cells, 0 outside. The identity leaves a map as it is, to the last bit.
 
     Args:
         maps: (B, C, H, W) of B agents, each in its own frame, covering the detector's range at any stride; rows are y,
@@ -30,11 +30,13 @@ def warp(maps: Tensor, ego_SE2_others: Sequence[SE2], config: PointPillarsConfig
     Returns:
         (B, C, H, W) in the ego's frame.
     """
-    if not len(maps):
+    moving = [row for row, pose in enumerate(ego_SE2_others) if pose != SE2()]
+    if not moving:
         return maps
-    theta = torch.from_numpy(np.stack([_normalised(pose, config) for pose in ego_SE2_others]))
-    grid = F.affine_grid(theta.to(maps.device, maps.dtype), list(maps.shape), align_corners=False)
-    return F.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    theta = torch.from_numpy(np.stack([_normalised(ego_SE2_others[row], config) for row in moving]))
+    grid = F.affine_grid(theta.to(maps.device, maps.dtype), [len(moving), *maps.shape[1:]], align_corners=False)
+    moved = F.grid_sample(maps[moving], grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return maps.index_copy(0, torch.tensor(moving, device=maps.device), moved.to(maps.dtype))
 
 
 def coverage(maps: Tensor, ego_SE2_others: Sequence[SE2], config: PointPillarsConfig) -> Tensor:
