@@ -1,4 +1,4 @@
-"""`cobevglue reproduce --quick` as users type it: every table of every method, on the shipped weights."""
+"""`cobevglue reproduce --quick`, on fewer frames: every table of every method, on the shipped weights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Rows]:
     pytest.importorskip("libsumo")
     out = tmp_path_factory.mktemp("quick")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        assert main(["reproduce", "--quick", "--workers", "1", "--out", str(out), "--json"]) == 0
+        assert main(["reproduce", "--quick", "--frames", "2", "--workers", "1", "--out", str(out), "--json"]) == 0
     assert (out / "index.html").is_file()
     assert (out / "report.md").is_file()
     return {table["name"]: rows_of(table) for table in json.loads(printed.getvalue())["tables"]["simulated test"]}
@@ -35,3 +35,23 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Rows]:
 def test_every_table_is_there(tables: dict[str, Rows]) -> None:
     assert {"noise_ap0.5", "noise_ap0.7", "attack", "registration", "ablation", "poses", "communication"} <= set(tables)
     assert len(tables["noise_ap0.5"]) == len(FUSION_METHODS) + 2  # and its fusion on given and on true poses
+
+
+@pytest.mark.parametrize("title", ["CoBEVGlue", "No collaboration", "True pose, CoBEVGlue's fusion"])
+def test_noise_is_nothing_to_whom_poses_are_nothing(tables: dict[str, Rows], title: str) -> None:
+    row = tables["noise_ap0.5"][title]
+    assert row["0.0/0.0"] == row["2.5/2.5"]
+
+
+def test_it_pays_to_see_together(tables: dict[str, Rows]) -> None:
+    rows = tables["noise_ap0.5"]
+    alone = rows["No collaboration"]["0.0/0.0"]
+    assert rows["True pose, CoBEVGlue's fusion"]["0.0/0.0"] > alone + 0.02
+    assert rows["CoBEVGlue"]["2.5/2.5"] > alone
+    given = rows["Given pose, CoBEVGlue's fusion"]
+    assert given["2.5/2.5"] < given["0.0/0.0"] - 0.02
+
+
+def test_bevglue_adds_next_to_nothing_to_what_is_sent(tables: dict[str, Rows]) -> None:
+    row = tables["communication"]["CoBEVGlue"]
+    assert 0.0 < row["bytes for alignment"] < 1e-3 * row["bytes"]
