@@ -66,16 +66,14 @@ backbone are frozen and not in these files; a file names the detector that it be
 
 - **Data**: simulated drives of the `train` networks only (SUMO traffic, embreex LiDAR; 2 or 3 agents), made by the
   command; no real cloud was used. Truth: objects that all agents together have at least 5 points on.
-- **Command**: `cobevglue train fusion --config METHOD --out runs/fusion/METHOD --set threads=1
-  optimisation.precision=bfloat16` (DiscoNet after `disconet-teacher`), then `python tools/pack_fusion.py {detector}
-  runs/fusion`. Settings, commit, seed and time are in each file's header; the machine was two cores of an AMD EPYC,
-  two runs side by side, 2026-11-25.
-- **Poses in training**: true ones with Gaussian noise on every agent (column *noise*), as the method's paper has it; for
-  `cobevglue`, whose paper says nothing, as much as BEVGlue's poses have. The learning rate of 3e-3 was chosen with
-  `cobevglue` on those frames; `fpv-rcnn`, `v2vnet-robust` and `v2x-vit` have 1e-3. One sample in five has nobody but the ego in it.
+- **Command**: `cobevglue train fusion --config METHOD --out runs/fusion/METHOD`, then
+  `python tools/pack_fusion.py {detector} runs/fusion`. Settings, commit, seed, machine and time are in each file's
+  header.
+- **Poses in training**: true ones with Gaussian noise on every agent (column *noise*), as the method's paper has it
+  where it says so. One sample in five has nobody but the ego in it.
 - **AP** below: 96 frames of the `validation` networks on true poses, objects with at least 5 points, range of the
-  detector; a check that training went well. On the same frames no collaboration has 0.844 / 0.745, late fusion 0.959 /
-  0.893, early fusion 0.923 / 0.781, DiscoNet's teacher 0.941 / 0.826. The figures to compare methods by are in `docs/results/`.
+  detector; a check that training went well. The figures to compare methods by are in `docs/results/`;
+  how learning rates were chosen is in `docs/collaboration.md`.
 
 | method | weights | file | noise | samples | time | AP 0.5 | AP 0.7 | commit |
 |---|---|---|---|---|---|---|---|---|
