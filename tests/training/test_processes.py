@@ -36,7 +36,7 @@ def torchrun(*words: object, new: Path | None = None) -> subprocess.CompletedPro
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(TESTS), "GLOO_SOCKET_IFNAME": LOOPBACK},
+            env={**os.environ, "PYTHONPATH": str(TESTS), "GLOO_SOCKET_IFNAME": LOOPBACK, "TORCH_GLOO_LAZY_INIT": "1"},
         ) as process:
             try:
                 out, error = process.communicate(timeout=75)
