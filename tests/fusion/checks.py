@@ -82,5 +82,5 @@ def assert_same_boxes(a: Boxes, b: Boxes, atol: float = 1e-4) -> None:
     assert len(a) == len(b) > 0
     assert a.score is not None
     assert b.score is not None
-    np.testing.assert_allclose(a.bev, b.bev, atol=atol, rtol=1e-5 if atol else 0.0)
+    np.testing.assert_allclose(a.bev, b.bev, atol=atol)
     np.testing.assert_allclose(a.score, b.score, atol=atol)

@@ -75,6 +75,8 @@ def process_group(device: str) -> Iterator[Processes]:
         return
     if chosen.startswith("cuda"):
         torch.cuda.set_device(chosen)
+    # Gloo (torch 2.13) otherwise connects all processes at once, and now and then hangs in that.
+    os.environ.setdefault("TORCH_GLOO_LAZY_INIT", "1")
     dist.init_process_group("nccl" if chosen.startswith("cuda") else "gloo")
     try:
         yield Processes(torch.device(chosen), dist.get_rank(), dist.get_world_size())
