@@ -21,6 +21,7 @@ from cobevglue.evaluation.detection_matching import DetectionFrame
 from cobevglue.perception import PointPillars
 from cobevglue.perception.config import DetectionConfig
 from cobevglue.perception.decode import decode
+from cobevglue.perception.facing import face
 from cobevglue.perception.head import HeadOutput
 from cobevglue.simulation.episodes import SimulatedEpisodes
 
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--clouds", type=int, default=120)
     arguments = parser.parse_args()
     name = str(arguments.weights)
-    detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+    detector = PointPillars.named(name)
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {name}\n")
     seen: list[tuple[Cloud, HeadOutput]] = []
     with torch.inference_mode():
@@ -73,8 +74,11 @@ def main() -> None:
 
 def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars, settings: DetectionConfig) -> DetectionFrame:
     """What these settings make of the network's output."""
-    ((boxes, _),) = decode(output, detector.anchors, settings)
-    return DetectionFrame(boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
+    assert cloud.points is not None
+    (found,) = decode(output, detector.anchors, settings)
+    if settings.second_look:
+        found = face(found, cloud.points, detector.facing)
+    return DetectionFrame(found.boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
 
 
 if __name__ == "__main__":

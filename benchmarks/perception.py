@@ -52,7 +52,7 @@ def main() -> None:
     data = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parent.parent.parent / "shared" / "data")) / "opv2v"
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
     name = str(arguments.weights)
-    detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+    detector = PointPillars.named(name)
     wanted = (arguments.only,) if arguments.only else ("real", "simulated", "alignment", "speed")
     if "real" in wanted:
         real(detector, data)

@@ -35,7 +35,7 @@ def said(*boxes: tuple[int, list[float], float, float]) -> HeadOutput:
 
 
 def decoded(output: HeadOutput, **settings: float) -> tuple[Boxes, FloatArray]:
-    ((boxes, variance),) = decode(output, GRID, DetectionConfig(**settings))  # type: ignore[arg-type]
+    ((boxes, variance, _),) = decode(output, GRID, DetectionConfig(**settings))  # type: ignore[arg-type]
     return boxes, variance
 
 

@@ -19,6 +19,7 @@ class Stage(str, Enum):
     """What can be trained."""
 
     DETECTOR = "detector"
+    FACING = "facing"
     FUSION = "fusion"
 
 
@@ -44,7 +45,15 @@ def train(
     start it with torchrun: torchrun --nproc-per-node 2 -m cobevglue train detector --config compact
     """
     try:
-        from cobevglue.training import DivergedError, load_config, load_fusion_config, train_detector, train_fusion
+        from cobevglue.training import (
+            DivergedError,
+            load_config,
+            load_facing_config,
+            load_fusion_config,
+            train_detector,
+            train_facing,
+            train_fusion,
+        )
     except ImportError as error:
         raise InputError(" ".join(str(error).split())) from error
     folder = out if out is not None else Path("runs") / f"{stage.value}-{Path(config).stem}"
@@ -53,9 +62,11 @@ def train(
             if stage is Stage.DETECTOR:
                 settings = load_config(config, changes or ())
                 result = train_detector(settings, folder, resume=resume, max_minutes=max_minutes)
+            elif max_minutes is not None:
+                raise ValueError("--max-minutes: is for the detector; all else takes minutes")
+            elif stage is Stage.FACING:
+                result = train_facing(load_facing_config(config, changes or ()), folder, resume=resume)
             else:
-                if max_minutes is not None:
-                    raise ValueError("--max-minutes: is for the detector; a fusion method takes minutes")
                 result = train_fusion(load_fusion_config(config, changes or ()), folder, resume=resume)
     except DivergedError as error:
         raise InputError(str(error)) from error

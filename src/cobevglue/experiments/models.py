@@ -39,7 +39,7 @@ class Models:
     def __init__(self, settings: StudySettings) -> None:
         self._settings = settings
         name = settings.detector
-        detector = PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
+        detector = PointPillars.named(name)
         self.detector = detector.to("cuda" if torch.cuda.is_available() else "cpu")
         self._methods: dict[str, FusionMethod] = {}
         self._fingerprints: dict[str, str] = {}

@@ -152,7 +152,7 @@ class FPVRCNN(SingleMapFusion):
         proposing = self.detection.model_copy(update={"score_threshold": self.proposal_score})
         found = decode(HeadOutput(*(values.detach() for values in output)), self.anchors, proposing)
         told = []
-        for shared, seen, (proposals, _) in zip(maps, agents, found, strict=True):
+        for shared, seen, (proposals, *_) in zip(maps, agents, found, strict=True):
             proposals = proposals.replace(label=None)
             keypoints = select_keypoints(seen.points, proposals, _MARGIN, _KEYPOINTS)
             told.append(_Told(proposals, keypoints, self.describe(self._at(keypoints, shared))))

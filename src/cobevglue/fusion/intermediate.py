@@ -28,10 +28,9 @@ from cobevglue.fusion.warp import coverage, warp
 from cobevglue.messages import Arrays
 from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
 from cobevglue.perception.checkpoint import fingerprint, load_checkpoint, load_weights, save_checkpoint
-from cobevglue.perception.decode import decode
+from cobevglue.perception.decode import Found, decode
 from cobevglue.perception.head import HeadOutput
 from cobevglue.se2 import SE2
-from cobevglue.typing import FloatArray
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -87,7 +86,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         self.head = copy.deepcopy(detector.head)
         self.turns = nn.ModuleList(Turn(channels) for channels in self.turned_channels())
         self.metadata: dict[str, Any] = {}
-        self.encoder = fingerprint(detector)
+        self.encoder = fingerprint(nn.ModuleList([detector.pillars, detector.backbone]))
 
     @abstractmethod
     def turned_channels(self) -> Sequence[int]:
@@ -178,11 +177,11 @@ class IntermediateFusion(FusionMethod, nn.Module):
         others = [self.received_maps(other.content) for other in received]
         maps = [torch.cat([m, *(o[i][None].to(m) for o in others)]) for i, m in enumerate(own)]
         fused = self._fuse(maps, [SE2(), *(other.ego_SE2_other for other in received)])
-        ((boxes, _),) = self.boxes(self.decode_maps([m[None] for m in fused]))
-        return boxes
+        (found,) = self.boxes(self.decode_maps([m[None] for m in fused]))
+        return found.boxes
 
-    def boxes(self, output: HeadOutput) -> list[tuple[Boxes, FloatArray]]:
-        """For each ego its K boxes, best first, and their (K, 3) variance of x, y [m^2] and yaw [rad^2]."""
+    def boxes(self, output: HeadOutput) -> list[Found]:
+        """What the head found for each ego, best first."""
         return decode(output, self.anchors, self.detection)
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
@@ -190,7 +189,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
         Args:
             path: where to; the file appears complete or not at all.
-            metadata: data, metrics, seed; the detector's fingerprint is added.
+            metadata: data, metrics, seed; the encoder's fingerprint is added.
             half: in float16, for half the size.
         """
         config = json.loads(self.config.model_dump_json())
@@ -210,7 +209,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         if differing:
             raise ValueError(f"{path}: for a detector with other settings: {', '.join(differing)}")
         if checkpoint.metadata.get("encoder") != self.encoder:
-            raise ValueError(f"{path}: was trained on the features of another detector")
+            raise ValueError(f"{path}: was trained on the features of another encoder")
         load_weights(self, checkpoint.weights, path)
         self.metadata = checkpoint.metadata
         return self.eval()

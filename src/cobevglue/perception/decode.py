@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from cobevglue.perception.loss import MAX_LOG_VARIANCE, MIN_LOG_VARIANCE
 from cobevglue.se2 import wrap_angle
 from cobevglue.typing import FloatArray
 
-__all__ = ["LABEL", "decode"]
+__all__ = ["LABEL", "Found", "decode"]
 
 LABEL = "vehicle"
 """The one class there is."""
@@ -24,8 +25,22 @@ _TEMPERATURE = 0.05
 """How fast a box's vote falls with its overlap: exp(-(1 - IoU)^2 / temperature) (He et al., CVPR 2019, equation 12)."""
 
 
-def decode(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> list[tuple[Boxes, FloatArray]]:
-    """The boxes of each cloud, best first, and how sure they are.
+class Found(NamedTuple):
+    """What was found in one cloud.
+
+    Attributes:
+        boxes: K boxes in the LiDAR's frame, best first, with score and label.
+        variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2]; of yaw modulo pi.
+        sure: (K,) how sure each is which way it faces, 0 to 1: by how much this way is more likely than the other.
+    """
+
+    boxes: Boxes
+    variance: FloatArray
+    sure: FloatArray
+
+
+def decode(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> list[Found]:
+    """The boxes of each cloud.
 
     Args:
         output: what the head says of B clouds.
@@ -33,13 +48,12 @@ def decode(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> 
         config: how to choose.
 
     Returns:
-        For each cloud its K boxes in the LiDAR's frame, with score and label, and the (K, 3) variance of x, y [m^2]
-        and yaw [rad^2].
+        What was found in each cloud.
     """
     return [_decode_one(HeadOutput(*(v[b] for v in output)), anchors, config) for b in range(len(output.logits))]
 
 
-def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> tuple[Boxes, FloatArray]:
+def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> Found:
     count = min(config.candidates, len(output.logits))
     logits, index = output.logits.float().topk(count)
     kept = torch.sigmoid(logits) >= config.score_threshold
@@ -57,15 +71,18 @@ def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig
     deviation = np.sqrt(variance[:, :2].sum(axis=1))
     ranked = candidates.replace(score=score * np.exp(-config.uncertainty_penalty * deviation))
     rows = nms(ranked, config.nms_iou)[: config.max_detections]
+    sure = np.tanh(np.abs(direction[:, 1] - direction[:, 0]) / 2)  # difference of the two probabilities
     boxes = candidates[rows]
     if config.variance_voting and len(boxes):
-        sure = np.tanh(np.abs(direction[:, 1] - direction[:, 0]) / 2)  # difference of the two probabilities
-        boxes = _vote(boxes, candidates, variance, sure, config.voting_iou)
-    return boxes, variance[rows]
+        boxes, agreed = _vote(boxes, candidates, variance, sure, config.voting_iou)
+        return Found(boxes, variance[rows], agreed)
+    return Found(boxes, variance[rows], sure[rows])
 
 
-def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, sure: FloatArray, min_iou: float) -> Boxes:
-    """K boxes moved to what the C candidates that overlap them say on average.
+def _vote(
+    boxes: Boxes, candidates: Boxes, variance: FloatArray, sure: FloatArray, min_iou: float
+) -> tuple[Boxes, FloatArray]:
+    """K boxes moved to what the C candidates that overlap them say on average, and (K,) how sure of their facing.
 
     Args:
         boxes: those that stay.
@@ -84,8 +101,9 @@ def _vote(boxes: Boxes, candidates: Boxes, variance: FloatArray, sure: FloatArra
     xy = np.column_stack([average(candidates.center[None, :, i, None], vote / variance[:, i])[:, 0] for i in range(2)])
     turn = candidates.yaw - boxes.yaw[:, None]
     assert candidates.score is not None
-    flipped = (vote * sure * candidates.score * np.cos(turn)).sum(axis=1) < 0.0
+    weight = vote * candidates.score
+    facing = (weight * sure * np.cos(turn)).sum(axis=1) / weight.sum(axis=1)
     turn -= math.pi * np.round(turn / math.pi)  # a flipped candidate knows the axis all the same
-    yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0] + math.pi * flipped)
+    yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0] + math.pi * (facing < 0.0))
     rest = average(np.column_stack([candidates.center[:, 2], candidates.size])[None], vote)
-    return boxes.replace(center=np.column_stack([xy, rest[:, 0]]), size=rest[:, 1:], yaw=yaw)
+    return boxes.replace(center=np.column_stack([xy, rest[:, 0]]), size=rest[:, 1:], yaw=yaw), np.abs(facing)

@@ -86,7 +86,9 @@ class Perception:
         with self._timed("head", seconds):
             output = self.detector.decode_features((first, second, third))
         with self._timed("boxes", seconds):
-            ((detections, variance),) = self.detector.boxes(output)
+            (found,) = self.detector.boxes(output)
+        with self._timed("facing", seconds):
+            detections, variance, _ = self.detector.faced(found, checked)
         with self._timed("tracking", seconds):
             assert detections.score is not None
             good = detections.score >= self.min_track_score

@@ -20,7 +20,8 @@ from cobevglue.perception.anchors import AnchorGrid
 from cobevglue.perception.backbone import Backbone, Neck
 from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from cobevglue.perception.config import PointPillarsConfig
-from cobevglue.perception.decode import decode
+from cobevglue.perception.decode import Found, decode
+from cobevglue.perception.facing import FacingNet, face
 from cobevglue.perception.head import Head, HeadOutput
 from cobevglue.perception.level import lifted, needed_raise
 from cobevglue.perception.pillars import PillarEncoder, batch_clouds
@@ -39,7 +40,8 @@ class PointPillars(nn.Module):
         boxes = detector.detect(points)  # (N, 4) x, y, z, intensity
 
     In three steps, so that fusion fits between: `forward` is `decode_features(multiscale(encode(clouds)))`. All maps
-    are (B, C, rows, columns); rows go along y and columns along x, both from min to max.
+    are (B, C, rows, columns); rows go along y and columns along x, both from min to max. `detect` looks a second time
+    at the points on what was found, to tell front from back (`facing`), which is trained on its own.
 
     Args:
         config: settings; `CONFIGS` has two. Weights are random, from torch's generator.
@@ -61,6 +63,7 @@ class PointPillars(nn.Module):
         self.backbone = Backbone(config)
         self.neck = Neck(config)
         self.head = Head(config)
+        self.facing = FacingNet()
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster so
 
     @property
@@ -91,9 +94,13 @@ class PointPillars(nn.Module):
         """What the head says of B clouds (N_i, 4) x, y, z [m], intensity."""
         return self.decode_features(self.multiscale(self.encode(clouds)))
 
-    def boxes(self, output: HeadOutput) -> list[tuple[Boxes, FloatArray]]:
-        """For each cloud its K boxes, best first, and their (K, 3) variance of x, y [m^2] and yaw [rad^2]."""
+    def boxes(self, output: HeadOutput) -> list[Found]:
+        """What the head found in each cloud, best first."""
         return decode(output, self.anchors, self.detection)
+
+    def faced(self, found: Found, points: Float32Array) -> Found:
+        """What the head found in a cloud (N, 4), the right way round, as far as a second look can tell."""
+        return face(found, points, self.facing) if self.detection.second_look else found
 
     def detect(self, points: ArrayLike) -> Boxes:
         """The vehicles in one cloud.
@@ -112,23 +119,26 @@ class PointPillars(nn.Module):
 
     def detect_batch(self, clouds: Sequence[ArrayLike]) -> list[Boxes]:
         """The vehicles in each of several clouds, see `detect`."""
-        return [boxes for boxes, _ in self._detect(clouds)]
+        return [found.boxes for found in self._detect(clouds)]
 
     def detect_with_uncertainty(self, points: ArrayLike) -> tuple[Boxes, FloatArray]:
         """The K vehicles in one cloud, and the (K, 3) variance of x, y [m^2] and yaw [rad^2] of each."""
-        return self._detect([points])[0]
+        found = self._detect([points])[0]
+        return found.boxes, found.variance
 
     @torch.inference_mode()
-    def _detect(self, clouds: Sequence[ArrayLike]) -> list[tuple[Boxes, FloatArray]]:
+    def _detect(self, clouds: Sequence[ArrayLike]) -> list[Found]:
         if not clouds:
             return []
         checked = [check_points(points) for points in clouds]
         raised = [needed_raise(points) for points in checked]
+        level = [lifted(points, z) for points, z in zip(checked, raised, strict=True)]
         with self._evaluating():
-            found = self.boxes(self([torch.from_numpy(lifted(p, z)) for p, z in zip(checked, raised, strict=True)]))
+            found = self.boxes(self([torch.from_numpy(points) for points in level]))
+            found = [self.faced(one, points) for one, points in zip(found, level, strict=True)]
         return [
-            (boxes.replace(center=boxes.center - (0.0, 0.0, z)), variance)
-            for (boxes, variance), z in zip(found, raised, strict=True)
+            one._replace(boxes=one.boxes.replace(center=one.boxes.center - (0.0, 0.0, z)))
+            for one, z in zip(found, raised, strict=True)
         ]
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
@@ -173,6 +183,15 @@ class PointPillars(nn.Module):
             hint = f"did you mean {near[0]!r}?" if near else f"{_WEIGHTS} has none"
             raise ValueError(f"no pretrained detector {str(name)!r}; {hint}")
         return cls.load(_WEIGHTS / f"{name}.safetensors")
+
+    @classmethod
+    def named(cls, name_or_file: str) -> PointPillars:
+        """The detector of this name that comes with the package, or the one in this `.safetensors` file.
+
+        Raises:
+            ValueError, FileNotFoundError: see `pretrained` and `load`.
+        """
+        return cls.load(name_or_file) if name_or_file.endswith(".safetensors") else cls.pretrained(name_or_file)
 
     def export_onnx(self, path: str | Path) -> None:
         """Write everything behind the pillars as an ONNX model: pseudo-images in, what the head says out.

@@ -7,7 +7,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,13 @@ import torch
 import cobevglue
 from cobevglue.datasets.whole_files import whole_file
 
-__all__ = ["RunState", "differing_keys", "load_state", "provenance", "save_state"]
+__all__ = ["LAST", "STATE", "RunState", "begin_run", "differing_keys", "load_state", "provenance", "save_state"]
+
+STATE, LAST = "state.pt", "last.safetensors"
+"""Files in the folder of every run."""
 
 _FORMAT = 1
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,43 @@ def load_state(path: Path, device: torch.device) -> RunState:
         return RunState(**{**content, "config": json.loads(content["config"])})
     except Exception as error:  # whatever unpickling broken bytes raises
         raise ValueError(f"{path}: not the state of a run: {' '.join(str(error).split())[:200]}") from error
+
+
+def begin_run(
+    folder: Path,
+    settings: Mapping[str, Any],
+    free_to_change: Collection[str],
+    *,
+    resume: bool,
+    processes: int = 1,
+    device: torch.device = _CPU,
+) -> RunState | None:
+    """What a run starts from: the state in its folder, or None for nothing.
+
+    Args:
+        folder: of the run.
+        settings: of the run, as plain data.
+        free_to_change: names of settings with which a run may go on differently.
+        resume: go on with the run in the folder.
+        processes: how many train together.
+        device: where the state is read to.
+
+    Raises:
+        FileNotFoundError: there is nothing to resume.
+        ValueError: there is a run already, or one with other settings, or its file is broken.
+    """
+    file = folder / STATE
+    if not resume:
+        if file.exists():
+            raise ValueError(f"{folder}: has a run already; resume it, or choose another folder")
+        return None
+    state = load_state(file, device)
+    differing = [key for key in differing_keys(state.config, settings) if key.partition(".")[0] not in free_to_change]
+    if state.processes != processes:
+        differing.append(f"number of processes ({state.processes} before, now {processes})")
+    if differing:
+        raise ValueError(f"{folder}: the run was started with other settings: {', '.join(differing)}")
+    return state
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> list[str]:

@@ -15,13 +15,7 @@ from torch.utils.data import DataLoader
 
 from cobevglue.perception import DetectionLoss, PointPillars
 from cobevglue.training.batches import Batch, Batches
-from cobevglue.training.checkpoint import (
-    RunState,
-    differing_keys,
-    load_state,
-    provenance,
-    save_state,
-)
+from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
 from cobevglue.training.optimisation import MeanWeights, autocast, learning_rate, make_optimizer
 from cobevglue.training.processes import Processes, process_group
@@ -33,7 +27,7 @@ from cobevglue.training.validation import Validation
 
 __all__ = ["DivergedError", "TrainingResult", "train_detector"]
 
-STATE, LAST, BEST = "state.pt", "last.safetensors", "best.safetensors"
+BEST = "best.safetensors"
 
 
 class DivergedError(RuntimeError):
@@ -128,20 +122,23 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.model = PointPillars(config.model)  # its convolutions are channels-last
+        self.model.facing.requires_grad_(False)  # looks at what was found: `train_facing`, afterwards
         self.model.to(processes.device)
         self.loss = DetectionLoss(config.model)
         self.epoch, self.elapsed = 0, 0.0
         self.best: float | None = None
-        state = None
-        if resume:
-            state = load_state(folder / STATE, processes.device)
-            self._refuse_other_settings(state)
+        state = begin_run(
+            folder,
+            config.model_dump(mode="json"),
+            FREE_TO_CHANGE,
+            resume=resume,
+            processes=processes.count,
+            device=processes.device,
+        )
+        if state is not None:
             self.model.load_state_dict(state.model)
-        else:
-            if (folder / STATE).exists():
-                raise ValueError(f"{folder}: has a run already; resume it, or choose another folder")
-            if config.init_from is not None:
-                _start_from(self.model, config.init_from)
+        elif config.init_from is not None:
+            _start_from(self.model, config.init_from)
         self.mean = MeanWeights(self.model, optimisation.mean_decay)
         self.optimizer = make_optimizer(self.model, optimisation)
         if state is not None:
@@ -305,14 +302,6 @@ class _Run:
             "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
         }
         self.mean.model.save(self.folder / name, metadata)
-
-    def _refuse_other_settings(self, state: RunState) -> None:
-        ours = self.config.model_dump(mode="json")
-        differing = [key for key in differing_keys(state.config, ours) if key not in FREE_TO_CHANGE]
-        if state.processes != self.processes.count:
-            differing.append(f"number of processes ({state.processes} before, now {self.processes.count})")
-        if differing:
-            raise ValueError(f"{self.folder}: the run was started with other settings: {', '.join(differing)}")
 
     def _distributed(self) -> nn.Module:
         if self.processes.count == 1:

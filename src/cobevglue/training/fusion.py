@@ -21,7 +21,7 @@ from cobevglue.fusion.disconet import DiscoNet, EarlyTeacher
 from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
-from cobevglue.training.checkpoint import RunState, differing_keys, load_state, provenance, save_state
+from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
@@ -37,7 +37,6 @@ _NORM_MOMENTUM = 0.1
 """Of the norms' running statistics: a hundredth, as the detector has it, would still remember the start after a run."""
 
 _SAMPLE_STREAM = 90
-_STATE, _LAST = "state.pt", "last.safetensors"
 
 
 class TrainFusionConfig(Settings):
@@ -154,10 +153,9 @@ def train_fusion(
 
 def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
     optimisation = config.optimisation
-    detector = _detector(config.detector)
+    detector = PointPillars.named(config.detector)
     model = _make_model(config, detector)
-    state = load_state(folder / _STATE, torch.device("cpu")) if resume else None
-    _check(config, folder, state)
+    state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume)
     frames, validation = (
         write_features(config.features / wanted.split, wanted, detector, report, config.threads)
         for wanted in (config.train, config.validation)
@@ -191,10 +189,10 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
                 metrics = _validate(mean.model, validation, report)
                 log.add("validation", (epoch + 1) * batches, epoch + 1, metrics)
             elapsed += time.monotonic() - started
-            mean.model.save(folder / _LAST, _metadata(config, epoch + 1, elapsed, metrics))
+            mean.model.save(folder / LAST, _metadata(config, epoch + 1, elapsed, metrics))
             content = config.model_dump(mode="json")
             states = (model.state_dict(), mean.model.state_dict(), optimizer.state_dict())
-            save_state(folder / _STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
+            save_state(folder / STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
     return TrainingResult(folder, optimisation.epochs, True, metrics, metrics.get("ap_0.7"))
 
 
@@ -261,9 +259,9 @@ def _validate(model: IntermediateFusion, frames: FusionFrames, report: Callable[
     with torch.inference_mode():
         for index in range(len(frames)):
             frame = frames[index]
-            ((boxes, _),) = model.boxes(model([_sample(frame, len(frame.seen), (0.0, 0.0), rng)]))
+            (one,) = model.boxes(model([_sample(frame, len(frame.seen), (0.0, 0.0), rng)]))
             counts = np.where(frame.ignored, 0, 1)
-            found.append(DetectionFrame(boxes, frame.truth, counts))
+            found.append(DetectionFrame(one.boxes, frame.truth, counts))
     (x_min, x_max), (y_min, y_max) = model.config.x_range, model.config.y_range
     result = evaluate_detections(
         found, thresholds=(0.5, 0.7), evaluation_range=(x_min, x_max, y_min, y_max), min_points=1
@@ -293,10 +291,6 @@ def _sample(frame: FusionFrame, agents: int, noise: tuple[float, float], rng: np
     )
 
 
-def _detector(name: str) -> PointPillars:
-    return PointPillars.load(name) if name.endswith(".safetensors") else PointPillars.pretrained(name)
-
-
 def _make_model(config: TrainFusionConfig, detector: PointPillars) -> IntermediateFusion:
     made = EarlyTeacher if config.method == TEACHER else fusion_class(config.method)
     if not issubclass(made, IntermediateFusion):
@@ -310,20 +304,6 @@ def _make_model(config: TrainFusionConfig, detector: PointPillars) -> Intermedia
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = _NORM_MOMENTUM
     return model
-
-
-def _check(config: TrainFusionConfig, folder: Path, state: RunState | None) -> None:
-    if state is None:
-        if (folder / _STATE).exists():
-            raise ValueError(f"{folder}: has a run already; resume it, or choose another folder")
-        return
-    differing = [
-        key
-        for key in differing_keys(state.config, config.model_dump(mode="json"))
-        if key.partition(".")[0] not in FREE_TO_CHANGE
-    ]
-    if differing:
-        raise ValueError(f"{folder}: the run was started with other settings: {', '.join(differing)}")
 
 
 def _metadata(config: TrainFusionConfig, epoch: int, elapsed: float, metrics: dict[str, float]) -> dict[str, object]:

@@ -7,12 +7,9 @@ encoder's maps in float16, detections, points, true poses, and the objects to fi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +23,7 @@ from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.frame import Frame
 from cobevglue.datasets.labelled_cloud import count_points
 from cobevglue.datasets.poses import inverse_SE3, transform_boxes
-from cobevglue.datasets.whole_files import whole_file, write_json
+from cobevglue.datasets.whole_files import whole_file
 from cobevglue.fusion.early import merge_points
 from cobevglue.fusion.method import Received
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars, PointPillarsConfig
@@ -35,6 +32,7 @@ from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
 from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenario
 from cobevglue.training.run_log import print_progress
+from cobevglue.training.shards import read_index, write_shards
 from cobevglue.typing import BoolArray, Float32Array, FloatArray
 
 __all__ = ["FeatureConfig", "FusionFrame", "FusionFrames", "make_frame", "write_features"]
@@ -130,10 +128,7 @@ class FusionFrames:
         Raises:
             FileNotFoundError: there is none.
         """
-        index = folder / "index.json"
-        if not index.is_file():
-            raise FileNotFoundError(f"{folder}: no finished features: {index.name} is not there")
-        content = json.loads(index.read_text(encoding="utf-8"))
+        content = read_index(folder)
         self.config = FeatureConfig.model_validate(content["config"])
         self.encoder: str = content["encoder"]
         self._files = [folder / name for name in content["files"]]
@@ -167,46 +162,24 @@ def write_features(
         ModuleNotFoundError: what simulates is not installed.
     """
     wanted = {"config": json.loads(config.model_dump_json()), "encoder": fingerprint(detector)}
-    folder.mkdir(parents=True, exist_ok=True)
-    started = folder / "settings.json"
-    if started.is_file() and json.loads(started.read_text(encoding="utf-8")) != wanted:
-        raise ValueError(f"{folder}: has features of other settings or of another detector; choose another folder")
-    write_json(started, wanted)
-    if not (folder / "index.json").is_file():
-        files: list[str] = []
-        with _map(processes) as mapped:
-            drives = mapped(partial(_write_scenario, folder, config, detector), range(config.scenarios))
-            for number, names in enumerate(drives, start=1):
-                files += names
-                if number % 10 == 0 or number == config.scenarios:
-                    report(f"features of {number} of {config.scenarios} drives, {len(files)} frames")
-        write_json(folder / "index.json", {**wanted, "files": files})
+
+    def progress(drives: int, frames: int) -> None:
+        if drives % 10 == 0 or drives == config.scenarios:
+            report(f"features of {drives} of {config.scenarios} drives, {frames} frames")
+
+    write = partial(_write_scenario, folder, config, detector)
+    write_shards(folder, wanted, config.scenarios, write, processes, progress)
     return FusionFrames(folder)
 
 
-@contextmanager
-def _map(processes: int) -> Iterator[Callable[[Callable[[int], list[str]], range], Iterable[list[str]]]]:
-    """`map`, in this process or in several."""
-    if processes == 1:
-        yield map
-    else:
-        fresh = get_context("spawn")  # a forked process inherits torch's threads in whatever state they are
-        with ProcessPoolExecutor(processes, fresh, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield pool.map
-
-
 def _write_scenario(folder: Path, config: FeatureConfig, detector: PointPillars, number: int) -> list[str]:
-    done = folder / f"{number:04d}.json"
-    if not done.is_file():
-        files = []
-        for index, frame in enumerate(_frames(number, config, detector)):
-            file = folder / f"{number:04d}_{index:02d}.safetensors"
-            with whole_file(file) as partial:
-                save_file(_as_tensors(frame), partial)
-            files.append(file.name)
-        write_json(done, files)
-    names: list[str] = json.loads(done.read_text(encoding="utf-8"))
-    return names
+    files = []
+    for index, frame in enumerate(_frames(number, config, detector)):
+        file = folder / f"{number:04d}_{index:02d}.safetensors"
+        with whole_file(file) as partial:
+            save_file(_as_tensors(frame), partial)
+        files.append(file.name)
+    return files
 
 
 def _frames(number: int, config: FeatureConfig, detector: PointPillars) -> Iterator[FusionFrame]:

@@ -43,8 +43,8 @@ class Validation:
                     output = model(clouds)
                 for name, value in self._loss(output, batch.targets.to(device))._asdict().items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(clouds)
-                for (detections, _), (truth, point_count) in zip(model.boxes(output), batch.truth, strict=True):
-                    frames.append(DetectionFrame(detections, truth, point_count))
+                for found, (truth, point_count) in zip(model.boxes(output), batch.truth, strict=True):
+                    frames.append(DetectionFrame(found.boxes, truth, point_count))
         parts = self._processes.gather((sums, frames))
         if not parts:
             return {}

@@ -1,0 +1,219 @@
+"""The training of a detector's second look, which tells front from back: `train_facing`. Minutes on a CPU."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import nn
+
+from cobevglue.perception import PointPillars
+from cobevglue.perception.facing import FacingNet
+from cobevglue.settings import Settings
+from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
+from cobevglue.training.config import DataConfig, settings_from
+from cobevglue.training.detector import DivergedError, TrainingResult
+from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
+from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, autocast, learning_rate, make_optimizer
+from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
+from cobevglue.training.sources import make_source
+
+__all__ = ["FACING_PRESETS", "TrainFacingConfig", "load_facing_config", "train_facing"]
+
+_SAMPLE_STREAM = 100
+
+_Count = Annotated[int, Field(ge=1)]
+
+
+class TrainFacingConfig(Settings):
+    """Settings of `train_facing`.
+
+    Attributes:
+        detector: that looks a second time; a name of shipped weights, or a file of a run. All else in it stays.
+        data: clouds; how their samples are shuffled does not matter here.
+        episodes: of the data, to train on.
+        validation_episodes: to measure on, after the last epoch.
+        examples: folder for what the detector finds in them; what is missing is computed first.
+        optimisation: how weights are found; a sample is a vehicle.
+        seed: of the episodes, the first weights and the order of samples.
+        threads: of torch; as many processes look at clouds.
+        report_every: time between lines of progress [s].
+    """
+
+    detector: str = "compact"
+    data: DataConfig = DataConfig(min_points=2)
+    episodes: _Count = 800
+    validation_episodes: _Count = 12
+    examples: Path = Path("runs/facing-examples")
+    optimisation: OptimisationConfig = OptimisationConfig(
+        epochs=10, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
+    )
+    seed: Annotated[int, Field(ge=0)] = 0
+    threads: _Count = 2
+    report_every: Annotated[float, Field(gt=0.0)] = 20.0
+
+
+FREE_TO_CHANGE = {"examples", "threads", "report_every"}
+"""A run may be resumed with other values of these."""
+
+
+def train_facing(
+    config: TrainFacingConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    report: Callable[[str], None] = print_progress,
+) -> TrainingResult:
+    """Train the second look of a detector, or go on with a run that was interrupted.
+
+    Args:
+        config: settings.
+        folder: of the run; made where missing. State is saved after each epoch; `last.safetensors` is the detector.
+        resume: go on with the run in `folder`.
+        report: takes lines of progress.
+
+    Raises:
+        ValueError: a folder that has a run already, or one with other settings; bad data.
+        FileNotFoundError: nothing to resume, or no such weights or data.
+        DivergedError: the loss is not finite any more.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.threads)
+    try:
+        return _train(config, folder, resume, report)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
+    optimisation = config.optimisation
+    detector = PointPillars.named(config.detector)
+    state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume)
+    training, validation = (_examples(config, detector, measured, report) for measured in (False, True))
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        net = FacingNet()
+    mean, optimizer = MeanWeights(net, optimisation.mean_decay), make_optimizer(net, optimisation)
+    first, elapsed = 0, 0.0
+    if state is not None:
+        net.load_state_dict(state.model)
+        mean.model.load_state_dict(state.mean_model)
+        optimizer.load_state_dict(state.optimizer)
+        first, elapsed = state.epoch, state.elapsed
+    metrics: dict[str, float] = {}
+    folder.mkdir(parents=True, exist_ok=True)
+    steps = _steps(optimisation)
+    with RunLog(folder, first * steps) as log:
+        for epoch in range(first, optimisation.epochs):
+            started = time.monotonic()
+            _train_epoch(config, training, net, mean, optimizer, epoch, log, report)
+            if epoch + 1 == optimisation.epochs:
+                metrics = _measure(mean.model, validation)
+                log.add("validation", (epoch + 1) * steps, epoch + 1, metrics)
+                report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+            elapsed += time.monotonic() - started
+            detector.facing.load_state_dict(mean.model.state_dict())
+            known = {"training": config.model_dump(mode="json"), "epoch": epoch + 1, "seconds": round(elapsed)}
+            detector.save(folder / LAST, {**provenance(), **known, "metrics": metrics})
+            states = (net.state_dict(), mean.model.state_dict(), optimizer.state_dict())
+            content = config.model_dump(mode="json")
+            save_state(folder / STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
+    return TrainingResult(folder, optimisation.epochs, True, metrics, None)
+
+
+def _examples(
+    config: TrainFacingConfig, detector: PointPillars, measured: bool, report: Callable[[str], None]
+) -> FacingExamples:
+    """What the detector finds in the training or the validation split."""
+    split = config.data.validation_split if measured else config.data.split
+    described = {
+        **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "workers"}),
+        "split": split,
+        "seed": config.seed,
+        "episodes": config.validation_episodes if measured else config.episodes,
+    }
+    source = make_source(config.data, config.seed, validation=measured)
+    return write_facing_examples(config.examples / split, source, described, detector, config.threads, report)
+
+
+def _steps(optimisation: OptimisationConfig) -> int:
+    return max(optimisation.samples_per_epoch // optimisation.batch_size, 1)
+
+
+def _train_epoch(
+    config: TrainFacingConfig,
+    examples: FacingExamples,
+    net: FacingNet,
+    mean: MeanWeights[FacingNet],
+    optimizer: torch.optim.Optimizer,
+    epoch: int,
+    log: RunLog,
+    report: Callable[[str], None],
+) -> None:
+    optimisation = config.optimisation
+    per_epoch = _steps(optimisation)
+    steps = optimisation.epochs * per_epoch
+    rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
+    meter, whole = Meter(), Meter()
+    net.train()
+    for step in range(epoch * per_epoch, (epoch + 1) * per_epoch):
+        rate = learning_rate(step, steps, optimisation)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        batch = examples.take(torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size)))
+        with autocast(optimisation, torch.device("cpu")):
+            logits = net(batch.looks)
+        loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(net.parameters(), optimisation.clip)
+        optimizer.step()
+        mean.update(net, step)
+        flipped = ((logits.detach() > 0) != batch.right).float().mean()
+        for m in (meter, whole):
+            m.add({"total": loss.detach(), "flipped": flipped}, len(logits), 0.0)
+        if meter.seconds >= config.report_every or step + 1 == (epoch + 1) * per_epoch:
+            numbers = {**meter.means(), "learning_rate": rate}
+            if not math.isfinite(numbers["total"]):
+                raise DivergedError(f"the loss is {numbers['total']} at step {step + 1}; lower the learning rate")
+            log.add("train", step + 1, epoch, numbers)
+            left = duration((steps - step - 1) * optimisation.batch_size / whole.means()["samples_per_second"])
+            report(
+                f"epoch {epoch + 1}/{optimisation.epochs} step {step + 1}/{steps}: total {numbers['total']:.4f} "
+                f"flipped {numbers['flipped']:.4f}, {numbers['samples_per_second']:.0f} vehicles/s, {left} left"
+            )
+            meter = Meter()
+
+
+@torch.inference_mode()
+def _measure(net: FacingNet, examples: FacingExamples) -> dict[str, float]:
+    """The loss, and the share of vehicles that are the wrong way round, without a second look and with it."""
+    right = examples.right
+    logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(torch.arange(len(right)), 1024)])
+    return {
+        "loss": float(F.binary_cross_entropy_with_logits(logits, right.float())),
+        "flipped_before": float((~right).float().mean()),
+        "flipped": float(((logits >= 0) != right).float().mean()),
+    }
+
+
+FACING_PRESETS: dict[str, TrainFacingConfig] = {"compact": TrainFacingConfig()}
+"""Shipped settings by the name of the detector."""
+
+
+def load_facing_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainFacingConfig:
+    """Settings by name or from a YAML file, with single values changed; see `load_config`.
+
+    Raises:
+        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
+        FileNotFoundError: there is no such file.
+    """
+    return settings_from(FACING_PRESETS, "compact", name_or_file, changes)

@@ -1,0 +1,88 @@
+"""What is computed once before a training and kept on disk: in pieces, so that it can be interrupted and shared out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cobevglue.datasets.whole_files import write_json
+
+__all__ = ["read_index", "write_shards"]
+
+_INDEX, _SETTINGS = "index.json", "settings.json"
+
+
+def write_shards(
+    folder: Path,
+    settings: Mapping[str, Any],
+    count: int,
+    write: Callable[[int], list[str]],
+    processes: int,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Make shards, or those that are missing; a finished folder of the same settings is left as it is.
+
+    Args:
+        folder: made where missing.
+        settings: all that the content depends on, as JSON can hold it; kept in `index.json`.
+        count: of shards.
+        write: makes one and returns the names of its files in `folder`; picklable.
+        processes: how many shards are made side by side, with one thread each.
+        progress: is told after each shard how many are done, and how many files there are.
+
+    Raises:
+        ValueError: the folder was made with other settings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    started = folder / _SETTINGS
+    if started.is_file() and json.loads(started.read_text(encoding="utf-8")) != settings:
+        raise ValueError(f"{folder}: was made with other settings or another detector; choose another folder")
+    write_json(started, settings)
+    if (folder / _INDEX).is_file():
+        return
+    files: list[str] = []
+    with _map(processes) as mapped:
+        for number, names in enumerate(mapped(partial(_write_missing, folder, write), range(count)), start=1):
+            files += names
+            progress(number, len(files))
+    write_json(folder / _INDEX, {**settings, "files": files})
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """The settings of a finished folder, and under "files" the names of its files.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    index = folder / _INDEX
+    if not index.is_file():
+        raise FileNotFoundError(f"{folder}: not finished: {index.name} is not there")
+    content: dict[str, Any] = json.loads(index.read_text(encoding="utf-8"))
+    return content
+
+
+@contextmanager
+def _map(processes: int) -> Iterator[Callable[[Callable[[int], list[str]], range], Iterable[list[str]]]]:
+    """`map`, in this process or in several."""
+    if processes == 1:
+        yield map
+    else:
+        fresh = get_context("spawn")  # a forked process inherits torch's threads in whatever state they are
+        with ProcessPoolExecutor(processes, fresh, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield pool.map
+
+
+def _write_missing(folder: Path, write: Callable[[int], list[str]], number: int) -> list[str]:
+    done = folder / f"{number:04d}.json"
+    if not done.is_file():
+        write_json(done, write(number))
+    names: list[str] = json.loads(done.read_text(encoding="utf-8"))
+    return names
