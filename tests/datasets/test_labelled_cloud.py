@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cobevglue import Boxes
-from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points
+from cobevglue.datasets.labelled_cloud import LabelledCloud, count_points, points_at
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,15 @@ def test_points_in_a_box(
 ) -> None:
     points = np.array([[-50, 0, 0, 0], [*point, 0.5], [50, 0, 0, 0]], dtype=np.float32)
     assert count_points(points, Boxes([(10, 0, 0)], [size], [yaw])).tolist() == [count]
+
+
+def test_points_at_a_box_come_in_its_axes_and_at_any_height() -> None:
+    points = np.array([[10, 1.5, 7, 0], [8.95, 0, 0, 0], [8.4, 0, 0, 0], [50, 0, 0, 0]], dtype=np.float32)
+    across = Boxes([(10, 0, 1)], [(4, 2, 1.5)], [math.pi / 2])  # faces along y
+    (found,) = points_at(points, across)
+    np.testing.assert_allclose(found, [(1.5, 0, 6)], atol=1e-6)
+    (found,) = points_at(points, across, margin=0.1)
+    np.testing.assert_allclose(found, [(0, 1.05, -1), (1.5, 0, 6)], atol=1e-6)
 
 
 def test_no_points_and_no_boxes() -> None:

@@ -124,7 +124,7 @@ def test_training_learns_and_leaves_the_encoder_alone(detector_file: Path, featu
     trained = MaxFusion(detector).load(tmp_path / "last.safetensors")
     assert trained.metadata["training"]["method"] == "cobevglue"
     assert not torch.equal(trained.head.logits.weight, detector.head.logits.weight)
-    with pytest.raises(ValueError, match="another detector"):
+    with pytest.raises(ValueError, match="another encoder"):
         MaxFusion(PointPillars(SMALL)).load(tmp_path / "last.safetensors")
     with pytest.raises(ValueError, match="fusion MaxFusion"):
         FCooper(detector).load(tmp_path / "last.safetensors")

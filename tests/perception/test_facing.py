@@ -1,0 +1,196 @@
+"""A second look tells front from back, whichever way the box was round."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cobevglue.boxes import Boxes
+from cobevglue.perception import Perception, PointPillars
+from cobevglue.perception.decode import Found
+from cobevglue.perception.facing import FacingNet, Looks, face, look_at
+from cobevglue.se2 import wrap_angle
+from cobevglue.typing import Float32Array
+
+from .conftest import OBJECTS, cloud_of
+
+
+def found(*vehicles: tuple[float, ...], sure: float = 0.5) -> Found:
+    """Vehicles x, y, z, l, w, h, yaw."""
+    rows = np.array(vehicles, dtype=np.float64).reshape(-1, 7)
+    boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], np.full(len(rows), 0.8), label=np.full(len(rows), "vehicle"))
+    return Found(boxes, np.full((len(rows), 3), 0.1), np.full(len(rows), sure))
+
+
+def random_net(seed: int = 0) -> FacingNet:
+    """With an opinion, but no idea."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        net = FacingNet()
+        torch.nn.init.normal_(net.vehicle[-1].weight)  # type: ignore[arg-type]
+    return net.eval()
+
+
+CAR = (10.0, 5.0, -1.0, 4.0, 2.0, 1.6, math.pi / 2)
+"""Faces along y."""
+
+
+@pytest.mark.parametrize(
+    ("point", "seen"),
+    [
+        ((10.0, 7.0, -1.0), (2.0, 0.0, 0.0)),  # on the bumper ahead
+        ((9.0, 5.0, -0.5), (0.0, 1.0, 0.5)),  # on the left door: left is towards -x
+        ((10.0, 7.25, -1.0), (2.25, 0.0, 0.0)),  # what the box missed by less than 0.3 m
+        ((10.0, 7.35, -1.0), None),  # by more
+        ((11.25, 5.0, -1.0), (0.0, -1.25, 0.0)),  # the same to the right
+        ((10.0, 5.0, 0.15), (0.0, 0.0, 1.15)),  # on a roof that is higher than was thought
+        ((10.0, 5.0, 0.25), None),  # a branch above it
+        ((10.0, 5.0, -1.85), (0.0, 0.0, -0.85)),  # hardly below it
+        ((10.0, 5.0, -1.95), None),  # the ground
+        ((math.nan, 5.0, -1.0), None),  # no point
+    ],
+)
+def test_points_are_seen_in_the_vehicles_axes(
+    point: tuple[float, float, float], seen: tuple[float, float, float] | None
+) -> None:
+    cloud = np.array([[-3.0, 0.0, 0.0, 0.1], [*point, 0.5]], dtype=np.float32)
+    looks = look_at(cloud, found(CAR))
+    assert looks.number.tolist() == [int(seen is not None)]
+    np.testing.assert_allclose(looks.points[0, 0].numpy(), (0, 0, 0) if seen is None else seen, atol=1e-5)
+    assert not looks.points[0, 1:].any()
+    np.testing.assert_allclose(looks.vehicle.numpy(), [[*CAR, 0.8, 0.5]], rtol=1e-6)
+
+
+def test_of_many_points_some_are_taken_all_over_the_vehicle_and_all_are_counted() -> None:
+    along = np.linspace(3.1, 6.9, 1000)
+    cloud = np.column_stack([np.full(1000, 10.0), along, np.full((1000, 2), -1.0)]).astype(np.float32)
+    looks = look_at(cloud, found(CAR))
+    assert looks.number.tolist() == [1000]
+    assert np.ptp(looks.points[0, :, 0].numpy()) > 3.6
+    assert len(np.unique(looks.points[0, :, 0].numpy())) == looks.points.shape[1]
+
+
+def clouds_and_vehicles() -> st.SearchStrategy[tuple[Float32Array, Found]]:
+    """A cloud of a few points about some vehicles, which may have none."""
+    number = st.floats(-30.0, 30.0, width=32)
+    vehicle = st.tuples(
+        number, number, st.floats(-2.0, 1.0), st.floats(2.0, 12.0), st.floats(0.8, 3.0), st.floats(1.0, 4.0),
+        st.floats(-math.pi, math.pi),
+    )  # fmt: skip
+    return st.tuples(
+        st.lists(vehicle, min_size=1, max_size=4), st.integers(0, 2**31), st.integers(0, 300), st.floats(0.0, 1.0)
+    ).map(lambda t: (_around(t[0], t[1], t[2]), found(*t[0], sure=t[3])))
+
+
+def _around(vehicles: list[tuple[float, ...]], seed: int, count: int) -> Float32Array:
+    rng = np.random.default_rng(seed)
+    center = np.array(vehicles)[rng.integers(len(vehicles), size=count), :3]
+    return np.column_stack([center + rng.normal(size=(count, 3)), rng.random(count)]).astype(np.float32)
+
+
+@given(clouds_and_vehicles(), st.integers(0, 5))
+def test_a_box_the_other_way_round_gets_the_opposite_answer(case: tuple[Float32Array, Found], seed: int) -> None:
+    """So the vehicle faces the same way after all, whatever the box said and whatever was learnt."""
+    cloud, vehicles = case
+    turned = vehicles._replace(
+        boxes=vehicles.boxes.replace(yaw=wrap_angle(vehicles.boxes.yaw + math.pi)), sure=-vehicles.sure
+    )
+    net = random_net(seed)
+    with torch.inference_mode():
+        one, other = net(look_at(cloud, vehicles)), net(look_at(cloud, turned))
+    assert torch.isfinite(one).all()
+    np.testing.assert_allclose(other.numpy(), -one.numpy(), atol=1e-3)
+
+
+@given(clouds_and_vehicles())
+def test_boxes_are_turned_where_the_answer_is_no_and_nothing_else_changes(case: tuple[Float32Array, Found]) -> None:
+    cloud, vehicles = case
+    net = random_net()
+    with torch.inference_mode():
+        wrong = net(look_at(cloud, vehicles)).numpy() < 0
+    after = face(vehicles, cloud, net)
+    np.testing.assert_allclose(np.abs(wrap_angle(after.boxes.yaw - vehicles.boxes.yaw)), math.pi * wrong, atol=1e-9)
+    np.testing.assert_array_equal(after.boxes.center, vehicles.boxes.center)
+    np.testing.assert_array_equal(after.boxes.size, vehicles.boxes.size)
+    np.testing.assert_array_equal(after.variance, vehicles.variance)
+    assert ((after.sure >= 0) & (after.sure <= 1)).all()
+    again = face(after, cloud, net)
+    assert len(again.boxes) == len(vehicles.boxes)
+
+
+def test_untrained_it_leaves_everything_as_it_is() -> None:
+    vehicles = found(CAR, (0.0, -8.0, -1.0, 4.5, 1.8, 1.5, 2.0))
+    after = face(vehicles, cloud_of(OBJECTS), FacingNet().eval())
+    np.testing.assert_array_equal(after.boxes.yaw, vehicles.boxes.yaw)
+    assert after.sure.tolist() == [0.0, 0.0]
+
+
+def test_nothing_found_is_nothing_to_look_at() -> None:
+    nothing = found()
+    assert face(nothing, cloud_of(OBJECTS), random_net()) is nothing
+
+
+def test_rows_behind_the_last_point_are_not_looked_at() -> None:
+    looks = look_at(_around([CAR], 0, 20), found(CAR))
+    rubbish = looks.points.clone()
+    rubbish[0, int(looks.number[0]) :] = 99.0
+    net = random_net()
+    with torch.inference_mode():
+        assert torch.equal(net(looks), net(Looks(rubbish, looks.number, looks.vehicle)))
+
+
+def test_it_learns_that_bonnets_are_low() -> None:
+    """From vehicles at all headings, half of whose boxes are the wrong way round; then on others."""
+
+    def vehicles(seed: int, count: int) -> tuple[Looks, torch.Tensor]:
+        rng = np.random.default_rng(seed)
+        xy = rng.uniform(-40, 40, (count, 2))
+        size = rng.uniform([3.6, 1.7, 1.4], [5.0, 2.0, 1.9], (count, 3))
+        yaw = rng.uniform(-math.pi, math.pi, count)
+        right = rng.random(count) < 0.5
+        number = rng.integers(8, 64, count)
+        p = rng.uniform(-0.5, 0.5, (count, 64, 3)) * size[:, None]
+        p[..., 2] -= 0.4 * size[:, None, 2] * (p[..., 0] > 0.15 * size[:, None, 0])
+        p[..., :2] *= np.where(right, 1.0, -1.0)[:, None, None]
+        said = np.where(right, yaw, yaw + math.pi)
+        vehicle = np.column_stack([xy, np.full(count, -1.0), size, said, np.full(count, 0.8), np.full(count, 0.3)])
+        looks = Looks(torch.from_numpy(p).float(), torch.from_numpy(number), torch.from_numpy(vehicle).float())
+        return looks, torch.from_numpy(right)
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        net = FacingNet()
+    looks, right = vehicles(1, 512)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    for _ in range(60):
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(net(looks), right.float())
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    looks, right = vehicles(2, 512)
+    with torch.inference_mode():
+        assert ((net(looks) > 0) == right).float().mean() > 0.95
+
+
+def test_a_detector_looks_twice_unless_told_not_to(trained: PointPillars) -> None:
+    """Alone and in `Perception`; the settings switch it off."""
+    cloud = cloud_of(OBJECTS)
+    first = trained.detection
+    trained.facing, net = random_net(3), trained.facing
+    try:
+        with torch.inference_mode():
+            (seen,) = trained.boxes(trained([torch.from_numpy(cloud)]))
+        wrong = trained.facing(look_at(cloud, seen)).detach().numpy() < 0
+        assert 0 < wrong.sum() < len(wrong)  # or this test would show little
+        expected = wrap_angle(seen.boxes.yaw + math.pi * wrong)
+        np.testing.assert_allclose(trained.detect(cloud).yaw, expected, atol=1e-6)
+        np.testing.assert_allclose(Perception(trained).step(cloud).detections.yaw, expected, atol=1e-6)
+        trained.detection = first.model_copy(update={"second_look": False})
+        np.testing.assert_allclose(trained.detect(cloud).yaw, seen.boxes.yaw, atol=1e-6)
+    finally:
+        trained.detection, trained.facing = first, net

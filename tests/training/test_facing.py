@@ -1,0 +1,127 @@
+"""The second look is trained on what the detector finds, and nothing else of the detector changes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cobevglue.perception import PointPillars
+from cobevglue.perception.facing import look_at
+from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
+from cobevglue.training import OptimisationConfig, TrainFacingConfig, load_facing_config, train_facing
+from cobevglue.training.config import DataConfig
+from cobevglue.training.facing_examples import examples_in
+
+DATA = DataConfig(min_points=2, options={"snapshots": 1, "agents": 2})
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("examples")
+
+
+def config(examples: Path, **changes: object) -> TrainFacingConfig:
+    values = {
+        "data": DATA,
+        "episodes": 2,
+        "validation_episodes": 1,
+        "examples": examples,
+        "optimisation": OptimisationConfig(epochs=2, samples_per_epoch=64, batch_size=16, mean_decay=0.5),
+        "threads": 1,
+    }
+    return TrainFacingConfig.model_validate({**values, **changes})
+
+
+def silent(_: str) -> None:
+    """Takes lines of progress."""
+
+
+def test_an_example_is_a_vehicle_that_was_found() -> None:
+    detector = PointPillars.pretrained("compact")
+    cloud = SimulatedEpisodes("validation", 3, EpisodeSettings(snapshots=1, agents=1)).episode(0)[0]
+    examples = examples_in(cloud, detector, min_points=2)
+    detector.detection = detector.detection.model_copy(update={"second_look": False})
+    boxes = detector.detect(cloud.points)
+    assert 0 < len(examples.right) <= len(boxes)
+    for vehicle, right, number in zip(examples.looks.vehicle, examples.right, examples.looks.number, strict=True):
+        nearest = np.hypot(*(cloud.boxes.center[:, :2] - vehicle[:2].numpy()).T).argmin()
+        assert (np.cos(cloud.boxes.yaw[nearest] - float(vehicle[6])) > 0) == bool(right)
+        assert cloud.point_count[nearest] >= 2
+        assert number >= 1
+    everything = examples_in(cloud, detector, min_points=10_000_000)
+    assert len(everything.right) == 0
+
+
+def test_training_changes_the_second_look_alone(examples: Path, tmp_path: Path) -> None:
+    result = train_facing(config(examples), tmp_path, report=silent)
+    assert result.finished
+    assert set(result.metrics) == {"loss", "flipped", "flipped_before"}
+    before, after = PointPillars.pretrained("compact"), PointPillars.load(tmp_path / "last.safetensors")
+    theirs = after.state_dict()
+    changed = {
+        name.split(".")[0] for name, value in before.state_dict().items() if not torch.equal(value, theirs[name])
+    }
+    assert changed == {"facing"}
+    assert after.metadata["training"]["episodes"] == 2
+    assert after.metadata["metrics"] == result.metrics
+    totals = [json.loads(line)["total"] for line in (tmp_path / "log.jsonl").read_text().splitlines()[:-1]]
+    assert len(totals) == 2
+
+
+def test_a_resumed_run_ends_as_one_that_was_never_interrupted(examples: Path, tmp_path: Path) -> None:
+    train_facing(config(examples), tmp_path / "whole", report=silent)
+
+    def interrupt(line: str) -> None:
+        if line.startswith("epoch 2"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_facing(config(examples), tmp_path / "halves", report=interrupt)
+    with pytest.raises(ValueError, match="has a run already"):
+        train_facing(config(examples), tmp_path / "halves", report=silent)
+    with pytest.raises(ValueError, match="other settings: seed"):
+        train_facing(config(examples, seed=3), tmp_path / "halves", resume=True, report=silent)
+    train_facing(config(examples), tmp_path / "halves", resume=True, report=silent)
+    whole, halves = (PointPillars.load(tmp_path / name / "last.safetensors") for name in ("whole", "halves"))
+    for one, other in zip(whole.facing.parameters(), halves.facing.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_examples_are_made_once_and_of_one_kind(examples: Path, tmp_path: Path) -> None:
+    train_facing(config(examples), tmp_path / "one", report=silent)
+    made = {file: file.stat().st_mtime_ns for file in examples.rglob("*.safetensors")}
+    assert len(made) == 3
+    train_facing(config(examples), tmp_path / "two", report=silent)
+    assert {file: file.stat().st_mtime_ns for file in examples.rglob("*.safetensors")} == made
+    with pytest.raises(ValueError, match="other settings"):
+        train_facing(config(examples, episodes=3), tmp_path / "three", report=silent)
+
+
+def test_a_detector_that_finds_nothing_has_nothing_to_look_at(tmp_path: Path) -> None:
+    blind = PointPillars.pretrained("compact")
+    assert blind.head.logits.bias is not None
+    with torch.no_grad():
+        blind.head.logits.bias.fill_(-50.0)
+    blind.save(tmp_path / "blind.safetensors")
+    changed = config(tmp_path / "examples", detector=str(tmp_path / "blind.safetensors"), episodes=1)
+    with pytest.raises(ValueError, match="found none"):
+        train_facing(changed, tmp_path / "run", report=silent)
+
+
+def test_an_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(ValueError, match="did you mean 'compact'"):
+        load_facing_config("compakt")
+
+
+def test_a_look_is_stored_to_the_millimetre() -> None:
+    """Half precision is enough for points within a vehicle's reach."""
+    detector = PointPillars.pretrained("compact")
+    cloud = SimulatedEpisodes("validation", 3, EpisodeSettings(snapshots=1, agents=1)).episode(0)[0]
+    with torch.inference_mode():
+        (found,) = detector.boxes(detector([torch.from_numpy(cloud.points)]))
+    exact = look_at(cloud.points, found).points
+    assert (exact.half().float() - exact).abs().max() < 5e-3
