@@ -62,7 +62,7 @@ def _row(name: str, method: IntermediateFusion, file: Path) -> str:
 _CARD = """# Model card: fusion methods on the `{detector}` detector
 
 What each method has beyond the detector: neck, head and its own layers, in half precision. The detector's pillars and
-backbone are frozen and not in these files; a file names the detector that it belongs to, and is refused by another.
+backbone are frozen and not in these files; a file has their fingerprint, and is refused by a detector with others.
 
 - **Data**: simulated drives of the `train` networks only (SUMO traffic, embreex LiDAR; 2 or 3 agents), made by the
   command; no real cloud was used. Truth: objects that all agents together have at least 5 points on.

@@ -49,8 +49,8 @@ class FacingExamples:
 
     def take(self, rows: Tensor) -> FacingExamples:
         """Those in these rows, in the precision of a network."""
-        points, number, vehicle = self.looks
-        return FacingExamples(Looks(points[rows].float(), number[rows], vehicle[rows]), self.right[rows])
+        looks = Looks(*(values[rows] for values in self.looks))
+        return FacingExamples(looks._replace(points=looks.points.float()), self.right[rows])
 
 
 @torch.inference_mode()
@@ -65,9 +65,8 @@ def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -
     known = np.flatnonzero(best >= _FOUND)
     known = known[cloud.point_count[of[known]] >= min_points]
     right = np.abs(wrap_angle(found.boxes.yaw[known] - cloud.boxes.yaw[of[known]])) <= math.pi / 2
-    at, number, vehicle = look_at(points, found)
-    rows = torch.from_numpy(known)
-    return FacingExamples(Looks(at[rows].half(), number[rows], vehicle[rows]), torch.from_numpy(right))
+    looks = Looks(*(values[torch.from_numpy(known)] for values in look_at(points, found)))
+    return FacingExamples(looks._replace(points=looks.points.half()), torch.from_numpy(right))
 
 
 def write_facing_examples(
@@ -109,11 +108,13 @@ def _write(folder: Path, source: EpisodeSource, detector: PointPillars, min_poin
     examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
     if not examples:
         return []
-    points, number, vehicle = (torch.cat(values) for values in zip(*(e.looks for e in examples), strict=True))
-    right = torch.cat([e.right for e in examples])
+    looks = {
+        name: torch.cat(values)
+        for name, values in zip(Looks._fields, zip(*(e.looks for e in examples), strict=True), strict=True)
+    }
     file = folder / f"{episode:04d}.safetensors"
     with whole_file(file) as partly:
-        save_file({"points": points, "number": number, "vehicle": vehicle, "right": right}, partly)
+        save_file({**looks, "right": torch.cat([e.right for e in examples])}, partly)
     return [file.name]
 
 
@@ -121,7 +122,5 @@ def _read(folder: Path) -> FacingExamples:
     parts = [load_file(folder / name) for name in read_index(folder)["files"]]
     if not sum(len(part["right"]) for part in parts):
         raise ValueError(f"{folder}: the detector found none of the objects")
-    points, number, vehicle, right = (
-        torch.cat([part[name] for part in parts]) for name in ("points", "number", "vehicle", "right")
-    )
-    return FacingExamples(Looks(points, number, vehicle), right)
+    joined = {name: torch.cat([part[name] for part in parts]) for name in (*Looks._fields, "right")}
+    return FacingExamples(Looks(*(joined[name] for name in Looks._fields)), joined["right"])
