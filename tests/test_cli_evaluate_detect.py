@@ -127,11 +127,8 @@ def test_simulated_clouds_are_made_on_the_way(weights: str, capsys: pytest.Captu
     assert report["overall"]["truth"] > 0
 
 
-def test_real_clouds(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
-    root = Path(__file__).parents[2] / "shared" / "data" / "opv2v"
-    if not root.is_dir():
-        pytest.skip(f"no real data in {root}")
-    words = ["--root", str(root), "--split", "test_culvercity", "--frames", "2", "--weights", weights, "--json"]
+def test_real_clouds(culver_city: Path, weights: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--root", str(culver_city), "--split", "test_culvercity", "--frames", "2", "--weights", weights, "--json"]
     assert evaluate(*words) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 2
 

@@ -1,4 +1,4 @@
-"""What another agent's features say of directions, said in the ego's directions.
+"""What an agent's features say of directions, said in the ego's directions.
 
 A detector's features tell which way things face, and that in the frame of the agent whose points they are of. Warping
 takes a feature to where it belongs and leaves what it says: a car that faces along the other's x axis still does, also
@@ -46,7 +46,7 @@ class Turn(nn.Module):
         """The same maps in the ego's directions.
 
         Args:
-            maps: (B, C, H, W) of B other agents, warped.
+            maps: (B, C, H, W) of B agents, warped.
             yaws: B headings of these agents in the ego's frame [rad].
             covered: (B, 1, H, W) 0 where an agent's map does not reach; it stays 0 there.
 
