@@ -3,7 +3,8 @@
     python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
 
 Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
-of each, commit, command and settings are kept. How boxes are chosen is no part of training, and is taken from
+of each, commit, command and settings are kept. The training of a second look (`train facing`) keeps those of its
+detector by itself. How boxes are chosen is no part of training, and is taken from
 `CONFIGS`.
 """
 
@@ -37,6 +38,7 @@ def main() -> None:
         stages += metadata.get("stages", [metadata])
     WEIGHTS.mkdir(exist_ok=True)
     file = WEIGHTS / f"{arguments.name}.safetensors"
+    stages += trained.metadata.pop("stages", [])
     detector.save(file, {"stages": [*stages, trained.metadata]}, half=True)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
 

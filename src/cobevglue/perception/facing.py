@@ -98,8 +98,9 @@ class FacingNet(nn.Module):
     """Tells front from back: a PointNet (Qi et al., CVPR 2017) that cannot but agree with itself.
 
     Its answer is g(look) - g(the look turned by 180 degrees), with g a network. So turning a vehicle's box round
-    changes the answer's sign and nothing else, and what is learnt of fronts holds for backs. Untrained, it is never
-    sure.
+    changes the answer's sign and nothing else, and what is learnt of fronts holds for backs. It is told from which side
+    and how far away a vehicle is seen, but neither its place nor its heading in the LiDAR's frame. Untrained, it is
+    never sure.
     """
 
     def __init__(self) -> None:
@@ -108,7 +109,7 @@ class FacingNet(nn.Module):
         self.point = nn.Sequential(nn.Linear(3, c), nn.ReLU(), nn.Linear(c, c), nn.ReLU(), nn.Linear(c, 2 * c))
         self.other = nn.Sequential(nn.Linear(8, c), nn.ReLU(), nn.Linear(c, c), nn.ReLU())
         self.vehicle = nn.Sequential(
-            nn.Linear(4 * c + 13, 2 * c), nn.ReLU(), nn.Linear(2 * c, c), nn.ReLU(), nn.Linear(c, 1)
+            nn.Linear(4 * c + 9, 2 * c), nn.ReLU(), nn.Linear(2 * c, c), nn.ReLU(), nn.Linear(c, 1)
         )
         last = self.vehicle[-1]
         assert isinstance(last, nn.Linear)
@@ -136,7 +137,7 @@ class FacingNet(nn.Module):
         distance = torch.hypot(x, y).clamp(min=1e-3)
         from_ahead, from_the_left = -(c * x + s * y) / distance, (s * x - c * y) / distance  # of the sensor
         facts = [size / 3.0, from_ahead, from_the_left, distance / _FAR, torch.log1p(number[:, None].float()) / 3.0]
-        facts += [c, s, center[:, :2] / _FAR, score, 3.0 * sign * sure]
+        facts += [score, 3.0 * sign * sure]
         parts = [most, others.amax(dim=1), others.sum(dim=1) / 4.0, *facts]
         answer: Tensor = self.vehicle(torch.cat(parts, dim=1))
         return answer[:, 0]
