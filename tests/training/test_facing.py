@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from cobevglue.perception import PointPillars
-from cobevglue.perception.facing import look_at
+from cobevglue.perception.facing import Looks, look_at
 from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
 from cobevglue.training import OptimisationConfig, TrainFacingConfig, load_facing_config, train_facing
 from cobevglue.training.config import DataConfig
+from cobevglue.training.facing import FacingAugmentation, augmented
 from cobevglue.training.facing_examples import examples_in
 
 DATA = DataConfig(min_points=2, options={"snapshots": 1, "agents": 2})
@@ -125,3 +126,33 @@ def test_a_look_is_stored_to_the_millimetre() -> None:
         (found,) = detector.boxes(detector([torch.from_numpy(cloud.points)]))
     exact = look_at(cloud.points, found).points
     assert (exact.half().float() - exact).abs().max() < 5e-3
+
+
+def test_augmentation_thins_shakes_and_hides_and_keeps_what_it_should() -> None:
+    """On 400 vehicles with 10 to 100 points each at (1, 2, 3), with two others around each."""
+    k = 400
+    number = torch.linspace(10, 100, k).long()
+    points = torch.where(torch.arange(64)[None, :, None] < number[:, None, None], torch.tensor([1.0, 2.0, 3.0]), 0.0)
+    vehicle, around = torch.full((k, 9), 0.5), torch.full((k, 8, 6), 0.5)
+    looks = Looks(points, number, vehicle, around)
+    random = torch.Generator().manual_seed(0)
+
+    nothing = FacingAugmentation(thinning=0.0, jitter=0.0, stretch=0.0, alone=0.0, unsure=0.0)
+    for before, after in zip(looks, augmented(looks, nothing, random), strict=True):
+        assert torch.equal(before, after)
+
+    some = FacingAugmentation(thinning=0.5, jitter=0.01, stretch=0.1, alone=0.25, unsure=0.25)
+    other = augmented(looks, some, random)
+    share = other.number / number
+    assert share.min() >= 0.5
+    assert share.max() <= 1.1
+    assert 0.7 < share.mean() < 0.85
+    there = torch.arange(64) < other.number[:, None]
+    stretched = other.points[there] / torch.tensor([1.0, 2.0, 3.0])
+    assert stretched.min() > 0.9 - 0.05
+    assert stretched.max() < 1.1 + 0.05
+    hidden = (other.around == 0).all(dim=(1, 2))
+    assert 0.15 < hidden.float().mean() < 0.35
+    assert torch.equal(other.around[~hidden], around[~hidden])
+    assert 0.15 < (other.vehicle[:, 8] == 0).float().mean() < 0.35
+    assert torch.equal(other.vehicle[:, :8], vehicle[:, :8])

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from pydantic import Field
-from torch import nn
+from torch import Tensor, nn
 
 from cobevglue.perception import PointPillars
-from cobevglue.perception.facing import FacingNet
+from cobevglue.perception.facing import FacingNet, Looks
 from cobevglue.settings import Settings
 from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
@@ -25,11 +25,37 @@ from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, aut
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 from cobevglue.training.sources import make_source
 
-__all__ = ["FACING_PRESETS", "TrainFacingConfig", "load_facing_config", "train_facing"]
+__all__ = [
+    "FACING_PRESETS",
+    "FacingAugmentation",
+    "TrainFacingConfig",
+    "augmented",
+    "load_facing_config",
+    "train_facing",
+]
 
 _SAMPLE_STREAM = 100
 
 _Count = Annotated[int, Field(ge=1)]
+_Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
+class FacingAugmentation(Settings):
+    """How looks are changed, so that nothing in them is relied on alone: other shapes, other sensors, other traffic.
+
+    Attributes:
+        thinning: up to this share of the points on a vehicle is dropped.
+        jitter: standard deviation by which each point is moved along each axis [m].
+        stretch: a vehicle's points are stretched along each axis by a factor between 1 - this and 1 + this.
+        alone: share of vehicles around which no other is seen.
+        unsure: share of vehicles of which the head's opinion is not known.
+    """
+
+    thinning: _Share = 0.7
+    jitter: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
+    stretch: _Share = 0.06
+    alone: _Share = 0.2
+    unsure: _Share = 0.2
 
 
 class TrainFacingConfig(Settings):
@@ -41,6 +67,7 @@ class TrainFacingConfig(Settings):
         episodes: of the data, to train on.
         validation_episodes: to measure on, after the last epoch.
         examples: folder for what the detector finds in them; what is missing is computed first.
+        augmentation: how what is seen of a vehicle is changed.
         optimisation: how weights are found; a sample is a vehicle.
         seed: of the episodes, the first weights and the order of samples.
         threads: of torch; as many processes look at clouds.
@@ -52,6 +79,7 @@ class TrainFacingConfig(Settings):
     episodes: _Count = 800
     validation_episodes: _Count = 12
     examples: Path = Path("runs/facing-examples")
+    augmentation: FacingAugmentation = FacingAugmentation()
     optimisation: OptimisationConfig = OptimisationConfig(
         epochs=10, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
     )
@@ -162,6 +190,7 @@ def _train_epoch(
     per_epoch = _steps(optimisation)
     steps = optimisation.epochs * per_epoch
     rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
+    random = torch.Generator().manual_seed(int(rng.integers(2**63)))
     meter, whole = Meter(), Meter()
     net.train()
     for step in range(epoch * per_epoch, (epoch + 1) * per_epoch):
@@ -169,8 +198,9 @@ def _train_epoch(
         for group in optimizer.param_groups:
             group["lr"] = rate
         batch = examples.take(torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size)))
+        looks = augmented(batch.looks, config.augmentation, random)
         with autocast(optimisation, torch.device("cpu")):
-            logits = net(batch.looks)
+            logits = net(looks)
         loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -191,6 +221,31 @@ def _train_epoch(
                 f"flipped {numbers['flipped']:.4f}, {numbers['samples_per_second']:.0f} vehicles/s, {left} left"
             )
             meter = Meter()
+
+
+def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator) -> Looks:
+    """Other looks at the same K vehicles, which face as before.
+
+    Args:
+        looks: points in float32.
+        config: how much is changed.
+        random: torch's, on the CPU.
+    """
+    points, number, vehicle, around = looks
+    k, most = points.shape[:2]
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=random)
+
+    left = (number * (1.0 - config.thinning * uniform(k))).ceil().long()
+    behind = torch.arange(most) >= number[:, None]
+    order = (uniform(k, most) + behind).argsort(dim=1)  # those that are there first, in any order
+    points = points.gather(1, order[..., None].expand(-1, -1, 3))
+    points = points * (1.0 + config.stretch * (2.0 * uniform(k, 1, 3) - 1.0))
+    points = points + config.jitter * torch.randn(points.shape, generator=random)
+    around = around * (uniform(k, 1, 1) >= config.alone)
+    vehicle = torch.cat([vehicle[:, :8], vehicle[:, 8:] * (uniform(k, 1) >= config.unsure)], dim=1)
+    return Looks(points, left, vehicle, around)
 
 
 @torch.inference_mode()
