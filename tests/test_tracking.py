@@ -169,6 +169,38 @@ def test_a_track_that_began_flipped_is_turned_round() -> None:
     assert wrap_angle(tracker.tracks.boxes.yaw[0]) == pytest.approx(np.radians(5), abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("seen", "told"),
+    [
+        ("....", "...."),
+        ("..!.", "...."),  # one is outvoted
+        (".!!.", "..!."),  # two of three are not: the track turns, and turns back
+        (".....!!.", "........"),  # two of many are
+        ("!...", "!!.."),  # two the other way are needed to take back the first
+        ("!!!!", "!!!!"),  # nobody knows better
+    ],
+)
+def test_boxes_face_as_most_of_their_track_did(seen: str, told: str) -> None:
+    """Which ones are flipped (!), as detected and as told, of a car that turns while a bus beside it does not."""
+    tracker = Sort()
+    for k, (flipped, expected) in enumerate(zip(seen, told, strict=True)):
+        boxes = cars([(k, 0), (0, 15)], [10 * k + 180 * (flipped == "!"), 90])
+        faced = tracker.faced(tracker.update(boxes))
+        right = wrap_angle(np.radians([10 * k + 180 * (expected == "!"), 90]))
+        np.testing.assert_allclose(np.cos(faced.yaw - right), 1.0, atol=1e-9)
+        np.testing.assert_array_equal(faced.center, boxes.center)
+
+
+def test_only_boxes_of_the_last_update_can_be_faced() -> None:
+    tracker = Sort()
+    boxes = tracker.update(cars([(0, 0), (0, 15)]))
+    assert tracker.faced(boxes[[1]]).track_id is not None
+    assert len(tracker.faced(boxes[:0])) == 0
+    for wrong in (cars([(0, 0)]), boxes.replace(track_id=[0, 7])):
+        with pytest.raises(ValueError, match="track_id of living tracks"):
+            tracker.faced(wrong)
+
+
 def test_a_turn_through_north_is_followed() -> None:
     tracker = Sort()
     for k in range(60):

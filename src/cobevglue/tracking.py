@@ -158,6 +158,25 @@ class Sort:
         ids = self._begin_new_tracks(rows, boxes, columns, time)
         return boxes.replace(track_id=ids)
 
+    def faced(self, boxes: Boxes) -> Boxes:
+        """Boxes of the last update, each turned by 180 degrees where it faces the other way than its track.
+
+        A track faces the way that most of its detections did.
+
+        Args:
+            boxes: some or all of what `update` returned last, in any order.
+
+        Raises:
+            ValueError: a box without a living track.
+        """
+        s = self._tracks
+        ids = _NONE if boxes.track_id is None else boxes.track_id
+        rows = np.searchsorted(s.id, ids)
+        if len(ids) != len(boxes) or not (rows < len(s)).all() or not (s.id[rows] == ids).all():
+            raise ValueError("boxes must have the track_id of living tracks, as update returns them")
+        turned = np.cos(boxes.yaw - s.yaw[rows]) < 0.0
+        return boxes.replace(yaw=np.where(turned, wrap_angle(boxes.yaw + np.pi), boxes.yaw))
+
     @property
     def tracks(self) -> Tracks:
         """The living tracks as filtered up to the last update."""
@@ -370,7 +389,7 @@ class _State:
     """
 
     def __init__(self) -> None:
-        self.id = _NONE
+        self.id = _NONE  # ascending
         self.position: _ComplexArray = np.zeros(0, dtype=np.complex128)  # (N,) [m]
         self.velocity: _ComplexArray = np.zeros(0, dtype=np.complex128)  # (N,) the object's own [m/s]
         self.variance = np.zeros((3, 0))  # of position, of position with velocity, of velocity

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from cobevglue.perception import Perception, PointPillars
 
@@ -33,6 +34,29 @@ def test_what_comes_out_belongs_together(trained: PointPillars) -> None:
     assert out.detections.score is not None
     assert out.detections.track_id is None
     assert out.boxes.score.tolist() == [s for s in out.detections.score if s >= 0.25]
+
+
+def test_a_vehicle_faces_one_way_as_long_as_it_is_seen(trained: PointPillars) -> None:
+    """The head is made to mix up front and back in one frame of four; all that is told stays as it was."""
+
+    def mix_up() -> None:
+        with torch.no_grad():
+            for values in trained.head.direction.parameters():
+                values.mul_(-1.0)
+
+    perception = Perception(trained, min_track_score=0.5)
+    seen = []
+    for frame in range(4):
+        if frame == 2:
+            mix_up()
+        out = perception.step(cloud_of(OBJECTS))
+        if frame == 2:
+            mix_up()
+        assert len(out.boxes) == 4
+        np.testing.assert_array_equal(out.detections.yaw[: len(out.boxes)], out.boxes.yaw)
+        seen.append(out.boxes.yaw[np.lexsort(np.round(out.boxes.center[:, :2]).T)])
+    for yaw in seen[1:]:
+        np.testing.assert_allclose(np.cos(yaw - seen[0]), 1.0, atol=1e-3)
 
 
 def test_after_a_reset_time_and_tracks_start_again(trained: PointPillars) -> None:

@@ -14,7 +14,7 @@ from cobevglue.boxes import Boxes
 from cobevglue.perception.level import lifted, needed_raise
 from cobevglue.perception.point_pillars import PointPillars, check_points
 from cobevglue.tracking import Sort
-from cobevglue.typing import ArrayLike, Float32Array, FloatArray
+from cobevglue.typing import ArrayLike, BoolArray, Float32Array, FloatArray
 
 __all__ = ["Perception", "PerceptionOutput"]
 
@@ -26,9 +26,10 @@ class PerceptionOutput:
     Attributes:
         points: (N, 4) float32 x, y, z [m], intensity: the cloud itself, raised.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
-        boxes: detections good enough to be tracked, with `track_id`: what the agent tells others.
+        boxes: detections good enough to be tracked, with `track_id`: what the agent tells others. Each faces the way
+            that most detections of its track did; the rest is as it was seen now.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2] of the K `boxes`.
-        detections: all detections, best first, down to the detector's own threshold.
+        detections: all detections, best first, down to the detector's own threshold; those in `boxes` face as there.
         seconds: time spent in each stage [s].
         raised: what was added to z [m] (`needed_raise`): 0 for a sensor on the roof of a car. Points and boxes of all
             agents have the ground at the same height so.
@@ -92,7 +93,8 @@ class Perception:
         with self._timed("tracking", seconds):
             assert detections.score is not None
             good = detections.score >= self.min_track_score
-            tracked = self.tracker.update(detections[good], time)
+            tracked = self.tracker.faced(self.tracker.update(detections[good], time))
+            detections = detections.replace(yaw=_put(detections.yaw, good, tracked.yaw))
         features = (first[0], second[0], third[0])
         return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
 
@@ -103,3 +105,10 @@ class Perception:
         if self.detector.device.type == "cuda":  # which answers before it is done
             torch.cuda.synchronize(self.detector.device)
         seconds[stage] = perf_counter() - start
+
+
+def _put(values: FloatArray, rows: BoolArray, new: FloatArray) -> FloatArray:
+    """A copy with other values in some rows."""
+    result = values.copy()
+    result[rows] = new
+    return result
