@@ -3,6 +3,7 @@
     python benchmarks/perception.py                    # everything below, about 10 minutes on two cores
     python benchmarks/perception.py --only real        # OPV2V clouds: average precision, headings, what is missed
     python benchmarks/perception.py --only simulated   # the simulated test split
+    python benchmarks/perception.py --only headings    # front and back, by the head, by the second look, by tracks
     python benchmarks/perception.py --only alignment   # BEVGlue on the detections of two real OPV2V agents
     python benchmarks/perception.py --only speed       # each stage, and memory
     python benchmarks/perception.py --weights runs/compact/last.safetensors
@@ -20,6 +21,7 @@ import platform
 import resource
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,20 +33,24 @@ from cobevglue.evaluation.alignment import AlignmentSequence, evaluate, summaris
 from cobevglue.evaluation.alignment_data import perceived_sequences
 from cobevglue.evaluation.detection import DetectionReport, evaluate_detections
 from cobevglue.evaluation.detection_data import dataset_clouds, detect, simulated_clouds
-from cobevglue.evaluation.detection_matching import find_failures
+from cobevglue.evaluation.detection_matching import DetectionFrame, find_failures
 from cobevglue.perception import Perception, PointPillars
 from cobevglue.simulation.episodes import SimulatedEpisodes
+from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenarios
 
+PARTS = ("real", "simulated", "headings", "alignment", "speed")
 SCENARIO = "TwoCars_1"
 RANGE = (-70.0, 70.0, -39.0, 39.0)
 TEST_CLOUDS = 400
 MIN_POINTS = 5
+DRIVES, DRIVE = 8, ScenarioSettings(frames=20, rate=10.0, agents=2)
+"""Simulated drives whose headings are counted."""
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("real", "simulated", "alignment", "speed"))
+    parser.add_argument("--only", choices=PARTS)
     parser.add_argument("--weights", default="compact", help="a shipped name, or a .safetensors file")
     parser.add_argument("--clouds", type=int, default=TEST_CLOUDS, help="simulated clouds")
     parser.add_argument("--split", default="test", help="of the simulated world")
@@ -53,11 +59,13 @@ def main() -> None:
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
     name = str(arguments.weights)
     detector = PointPillars.named(name)
-    wanted = (arguments.only,) if arguments.only else ("real", "simulated", "alignment", "speed")
+    wanted = (arguments.only,) if arguments.only else PARTS
     if "real" in wanted:
         real(detector, data)
     if "simulated" in wanted:
         simulated(detector, arguments.split, arguments.clouds)
+    if "headings" in wanted:
+        headings(detector, data, arguments.split)
     if "alignment" in wanted:
         alignment(detector, data)
     if "speed" in wanted:
@@ -100,6 +108,38 @@ def show(title: str, report: DetectionReport) -> None:
 def vars_of(errors: object) -> dict[str, float]:
     """The fields of a dataclass with slots."""
     return {name: float(getattr(errors, name)) for name in getattr(errors, "__dataclass_fields__", {})}
+
+
+def headings(detector: PointPillars, data: Path, split: str) -> None:
+    """Which share of true positives (IoU 0.5, score >= 0.3) is the wrong way round, in drives at 10 Hz."""
+    print("\n## Headings\n\n| clouds | true positives | head alone | second look | and tracked | head, tracked |")
+    print("|---|---|---|---|---|---|")
+    once = PointPillars(detector.config)
+    once.load_state_dict(detector.state_dict())
+    once.eval().detection = detector.detection.model_copy(update={"second_look": False})
+    drives = {
+        f"OPV2V {SCENARIO}": [OPV2V(data, "test_culvercity")[SCENARIO]],
+        f"simulated {split} split, {DRIVES} drives": simulated_scenarios(split, DRIVES, settings=DRIVE),
+    }
+    for name, scenarios in drives.items():
+        seen: dict[str, list[DetectionFrame]] = {"once": [], "twice": [], "tracked": [], "once, tracked": []}
+        for scenario in scenarios:
+            perceivers: dict[tuple[str, bool], Perception] = {}
+            for cloud in dataset_clouds([scenario]):
+                if cloud.points is None:
+                    continue
+                for kind, one in (("once", once), ("twice", detector)):
+                    seen[kind].append(detect(cloud, one))
+                    perceiver = perceivers.setdefault((cloud.agent, one is detector), Perception(one))
+                    boxes = perceiver.step(cloud.points).boxes
+                    tracked = "tracked" if one is detector else "once, tracked"
+                    seen[tracked].append(replace(seen[kind][-1], detections=boxes, detection_point_count=None))
+        errors = {
+            kind: evaluate_detections(frames, evaluation_range=RANGE, min_points=1).errors
+            for kind, frames in seen.items()
+        }
+        cells = [f"{errors[kind].flipped:.1%}" for kind in ("once", "twice", "tracked", "once, tracked")]
+        print(f"| {name} | {errors['twice'].count} | " + " | ".join(cells) + " |", flush=True)
 
 
 def alignment(detector: PointPillars, data: Path) -> None:

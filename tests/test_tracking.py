@@ -191,6 +191,24 @@ def test_boxes_face_as_most_of_their_track_did(seen: str, told: str) -> None:
         np.testing.assert_array_equal(faced.center, boxes.center)
 
 
+def test_one_that_is_sure_outvotes_two_that_are_not() -> None:
+    tracker = Sort()
+    told = []
+    for flipped, sure in ((False, 0.9), (True, 0.2), (True, 0.2), (False, 0.9), (True, 1.0), (True, 1.0)):
+        boxes = tracker.update(cars([(0, 0)], 180 * flipped), sure=np.array([sure]))
+        told.append(bool(np.cos(tracker.faced(boxes).yaw[0]) < 0))
+    assert told == [False, False, False, False, False, True]
+
+
+@pytest.mark.parametrize("sure", [[0.5], [0.5, 1.1], [0.5, -0.1], [0.5, np.nan], [[0.5, 0.5]]])
+def test_bad_votes_are_refused_and_change_nothing(sure: object) -> None:
+    tracker = Sort()
+    with pytest.raises(ValueError, match=r"sure must be 2 numbers in \[0, 1\]"):
+        tracker.update(cars([(0, 0), (0, 15)]), 5.0, np.array(sure))
+    assert len(tracker.tracks.boxes) == 0
+    tracker.update(cars([(0, 0), (0, 15)]), 1.0)  # time did not go on
+
+
 def test_only_boxes_of_the_last_update_can_be_faced() -> None:
     tracker = Sort()
     boxes = tracker.update(cars([(0, 0), (0, 15)]))

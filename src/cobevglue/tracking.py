@@ -133,7 +133,7 @@ class Sort:
         self._tracks = _State()
         self._frame = _FrameMotion(self.config)
 
-    def update(self, boxes: Boxes, time: float | None = None) -> Boxes:
+    def update(self, boxes: Boxes, time: float | None = None, sure: FloatArray | None = None) -> Boxes:
         """Identities for the boxes of the next frame.
 
         The boxes come back as they are, every one and in the same order: detections, not filtered states. What the
@@ -143,25 +143,30 @@ class Sort:
             boxes: N detections in the agent's frame; scores, labels and any `track_id` play no part.
             time: when they were seen [s], on any clock; by default `config.period` after the last update. After a gap
                 longer than `config.max_age` all tracks are new.
+            sure: (N,) from 0 to 1, how sure it is which way each box faces; as sure of all if None.
 
         Returns:
             The N boxes with `track_id`.
 
         Raises:
-            ValueError: `time` is not finite or not later than the last one; the tracker is then as it was.
+            ValueError: `time` is not finite or not later than the last one, or `sure` is not one number in [0, 1] for
+                each box; the tracker is then as it was.
         """
+        votes = np.ones(len(boxes)) if sure is None else np.asarray(sure, dtype=np.float64)
+        if votes.shape != (len(boxes),) or not ((votes >= 0.0) & (votes <= 1.0)).all():
+            raise ValueError(f"sure must be {len(boxes)} numbers in [0, 1], got shape {votes.shape}: {votes}")
         time, dt = self._advance(time)
         self._end_lost_tracks(time)
         self._predict(dt)
         rows, columns = self._associate(boxes, dt)
-        self._correct(rows, boxes, columns, time)
-        ids = self._begin_new_tracks(rows, boxes, columns, time)
+        self._correct(rows, boxes, columns, time, votes)
+        ids = self._begin_new_tracks(rows, boxes, columns, time, votes)
         return boxes.replace(track_id=ids)
 
     def faced(self, boxes: Boxes) -> Boxes:
         """Boxes of the last update, each turned by 180 degrees where it faces the other way than its track.
 
-        A track faces the way that most of its detections did.
+        A track faces the way that most of its detections did, later ones and sure ones counting more.
 
         Args:
             boxes: some or all of what `update` returned last, in any order.
@@ -265,7 +270,7 @@ class Sort:
         inside = cost[rows, columns] < gate
         return rows[inside], columns[inside]
 
-    def _correct(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float) -> None:
+    def _correct(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float, votes: FloatArray) -> None:
         """The Kalman update of the associated tracks; heading and shape by a share of what is new in the detection."""
         s = self._tracks
         position, mixed, velocity = s.variance[:, rows]
@@ -282,12 +287,14 @@ class Sort:
         turn = boxes.yaw[columns] - yaw
         half_turns = np.round(turn / np.pi)
         front = s.front[rows]
-        front += _FRONT_GAIN * (1.0 - 2.0 * (half_turns % 2.0) - front)
+        front += _FRONT_GAIN * (votes[columns] * (1.0 - 2.0 * (half_turns % 2.0)) - front)
         # Brought within 90 degrees, a flipped detection turns nothing; if most are flipped, the track itself was.
         s.yaw[rows] = yaw + _HEADING_GAIN * (turn - np.pi * half_turns) + np.pi * (front < 0.0)
         s.front[rows] = np.abs(front)
 
-    def _begin_new_tracks(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float) -> IntArray:
+    def _begin_new_tracks(
+        self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float, votes: FloatArray
+    ) -> IntArray:
         """Birth: a new identity for each box that continues no track. Returns the identities of all boxes (N,)."""
         ids = np.full(len(boxes), -1, dtype=np.int64)
         ids[columns] = self._tracks.id[rows]
@@ -295,7 +302,7 @@ class Sort:
         if len(new):
             ids[new] = np.arange(self._next_id, self._next_id + len(new))
             self._next_id += len(new)
-            self._tracks.append(ids[new], boxes, new, time, self.config)
+            self._tracks.append(ids[new], boxes, new, time, votes, self.config)
         return ids
 
 
@@ -406,7 +413,9 @@ class _State:
         for name, values in vars(self).items():
             setattr(self, name, values[:, alive] if name == "variance" else values[alive])
 
-    def append(self, ids: IntArray, boxes: Boxes, rows: IntArray, time: float, config: SortConfig) -> None:
+    def append(
+        self, ids: IntArray, boxes: Boxes, rows: IntArray, time: float, votes: FloatArray, config: SortConfig
+    ) -> None:
         """Add tracks of these rows of `boxes`, at rest as far as one can tell."""
         n = len(rows)
         prior = np.array([config.position_noise**2, 0.0, config.velocity_prior**2])
@@ -417,7 +426,7 @@ class _State:
         self.shape = np.concatenate([self.shape, _shape(boxes)[rows]])
         self.yaw = np.concatenate([self.yaw, boxes.yaw[rows]])
         # One flipped detection next shall not turn the track, a second shall.
-        self.front = np.concatenate([self.front, np.full(n, 1.5 * _FRONT_GAIN)])
+        self.front = np.concatenate([self.front, 1.5 * _FRONT_GAIN * votes[rows]])
         self.seen = np.concatenate([self.seen, np.full(n, time)])
 
 

@@ -89,11 +89,11 @@ class Perception:
         with self._timed("boxes", seconds):
             (found,) = self.detector.boxes(output)
         with self._timed("facing", seconds):
-            detections, variance, _ = self.detector.faced(found, checked)
+            detections, variance, sure = self.detector.faced(found, checked)
         with self._timed("tracking", seconds):
             assert detections.score is not None
             good = detections.score >= self.min_track_score
-            tracked = self.tracker.faced(self.tracker.update(detections[good], time))
+            tracked = self.tracker.faced(self.tracker.update(detections[good], time, sure[good]))
             detections = detections.replace(yaw=_put(detections.yaw, good, tracked.yaw))
         features = (first[0], second[0], third[0])
         return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
