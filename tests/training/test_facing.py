@@ -69,6 +69,8 @@ def test_training_changes_the_second_look_alone(examples: Path, tmp_path: Path) 
     assert changed == {"facing"}
     assert after.metadata["training"]["episodes"] == 2
     assert after.metadata["metrics"] == result.metrics
+    detectors = [stage for stage in before.metadata["stages"] if "train detector" in stage["command"]]
+    assert after.metadata["stages"] == detectors  # an earlier second look is not among what this one is made of
     totals = [json.loads(line)["total"] for line in (tmp_path / "log.jsonl").read_text().splitlines()[:-1]]
     assert len(totals) == 2
 

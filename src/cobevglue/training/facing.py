@@ -34,6 +34,7 @@ __all__ = [
     "train_facing",
 ]
 
+_STAGE = "facing"
 _SAMPLE_STREAM = 100
 
 _Count = Annotated[int, Field(ge=1)]
@@ -123,6 +124,9 @@ def train_facing(
 def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
     optimisation = config.optimisation
     detector = PointPillars.named(config.detector)
+    # How the detector came about stays known; of an earlier second look nothing is left.
+    earlier = detector.metadata.get("stages", [detector.metadata])
+    detector.metadata = {"stages": [stage for stage in earlier if stage.get("stage") != _STAGE]}
     state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume)
     training, validation = (_examples(config, detector, measured, report) for measured in (False, True))
 
@@ -149,8 +153,8 @@ def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callab
                 report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
             elapsed += time.monotonic() - started
             detector.facing.load_state_dict(mean.model.state_dict())
-            known = {"training": config.model_dump(mode="json"), "epoch": epoch + 1, "seconds": round(elapsed)}
-            detector.save(folder / LAST, {**provenance(), **known, "metrics": metrics})
+            known = {"stage": _STAGE, "training": config.model_dump(mode="json"), "epoch": epoch + 1}
+            detector.save(folder / LAST, {**provenance(), **known, "seconds": round(elapsed), "metrics": metrics})
             states = (net.state_dict(), mean.model.state_dict(), optimizer.state_dict())
             content = config.model_dump(mode="json")
             save_state(folder / STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
