@@ -15,6 +15,7 @@ from cobevglue.boxes import covers_origin
 from cobevglue.datasets import OPV2V
 from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.fusion import FUSION_METHODS, FusionMethod, IntermediateFusion, fusion_class
+from cobevglue.iou import bev_iou
 from cobevglue.perception import PointPillars, PointPillarsConfig
 from cobevglue.se2 import SE2
 
@@ -121,6 +122,23 @@ def test_bevglue_finds_the_real_pose_and_others_see_what_the_ego_does_not(
         sent = out.message_bytes["car2"]
         assert sent["features"] == 0
         assert sent["boxes"] > out.alignment_bytes["car2"] > 0
+
+
+def test_what_comes_out_faces_as_the_ego_told_others_it_does(frames: RealFrames, compact: PointPillars) -> None:
+    """The fused head is made to mix up front and back; the boxes that the ego tracks know better."""
+    confused = method("cobevglue", compact)
+    assert isinstance(confused, IntermediateFusion)
+    with torch.no_grad():
+        for values in confused.head.direction.parameters():
+            values.mul_(-1.0)
+    system = CoBEVGlue(compact, confused, group_aligner("bevglue"))
+    clouds, _, time = frames[0]
+    seen = {"car1": system.perceive("car1", clouds["car1"], time)}
+    boxes, own = system.collaborate(seen, "car1", time).boxes, seen["car1"].boxes
+    iou = bev_iou(boxes, own)
+    rows = np.flatnonzero(iou.max(axis=1) > 0.5)
+    assert len(rows) > 10
+    assert (np.cos(boxes.yaw[rows] - own.yaw[iou[rows].argmax(axis=1)]) > 0).all()
 
 
 def test_the_bytes_of_the_feature_message_are_its_three_maps_in_float16() -> None:

@@ -19,6 +19,7 @@ from cobevglue.alignment.group import GroupAligner, Observation
 from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.fusion import FusionMethod, Received, pretrained_fusion
+from cobevglue.fusion.facing import face_as_told
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars
 from cobevglue.typing import ArrayLike, FloatArray
@@ -150,6 +151,7 @@ class CoBEVGlue:
 
         with _timed("fusion", spent):
             boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
+            boxes = face_as_told(boxes, _told(seen[ego], observations, alignments))
             boxes = boxes[~covers_origin(boxes)]  # others see the ego, too
             boxes = boxes.replace(center=boxes.center - (0.0, 0.0, seen[ego].raised))
         self._frame += 1
@@ -178,6 +180,17 @@ class CoBEVGlue:
                 sent[agent].update({kind: len(data) for kind, data in parts.items()})
             observations[agent] = needed
         return observations
+
+
+def _told(
+    ego: PerceptionOutput, observations: Mapping[str, Observation], alignments: Mapping[str, Alignment]
+) -> Iterator[Boxes]:
+    """The ego's own boxes, and those that arrived from agents whose pose is known, in the ego's frame."""
+    yield ego.boxes
+    for agent, alignment in alignments.items():
+        boxes = observations[agent].boxes
+        if boxes is not None and alignment.ego_SE2_other is not None:
+            yield boxes.transform(alignment.ego_SE2_other)
 
 
 def _pose(agent: str, poses: Mapping[str, ArrayLike]) -> FloatArray:
