@@ -15,9 +15,9 @@ from torch.utils.data import DataLoader
 
 from cobevglue.perception import DetectionLoss, PointPillars
 from cobevglue.training.batches import Batch, Batches
-from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
+from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
-from cobevglue.training.optimisation import MeanWeights, autocast, learning_rate, make_optimizer
+from cobevglue.training.optimisation import Learner, autocast
 from cobevglue.training.processes import Processes, process_group
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 from cobevglue.training.samples import EpisodeSource
@@ -135,15 +135,10 @@ class _Run:
             processes=processes.count,
             device=processes.device,
         )
-        if state is not None:
-            self.model.load_state_dict(state.model)
-        elif config.init_from is not None:
+        if state is None and config.init_from is not None:
             _start_from(self.model, config.init_from)
-        self.mean = MeanWeights(self.model, optimisation.mean_decay)
-        self.optimizer = make_optimizer(self.model, optimisation)
+        self.learner = Learner(self.model, optimisation, state)
         if state is not None:
-            self.mean.model.load_state_dict(state.mean_model)
-            self.optimizer.load_state_dict(state.optimizer)
             self.epoch, self.elapsed, self.best = state.epoch, state.elapsed, state.best
         self.net = self._distributed()
         if processes.device.type == "cuda":
@@ -220,18 +215,11 @@ class _Run:
             asked = time.monotonic()
             batch = next(batches)
             waited = time.monotonic() - asked
-            rate = learning_rate(step, self.steps, optimisation)
-            for group in self.optimizer.param_groups:
-                group["lr"] = rate
             with autocast(optimisation, device):
                 output = self.net(batch.clouds(device))
             terms = self.loss(output, batch.targets.to(device))
-            self.optimizer.zero_grad(set_to_none=True)
-            terms.total.backward()  # type: ignore[no-untyped-call]
-            norm = nn.utils.clip_grad_norm_(self.model.parameters(), optimisation.clip)
-            self.optimizer.step()
-            self.mean.update(self.model, step)
-            values = {**{name: term.detach() for name, term in terms._asdict().items()}, "gradient": norm.detach()}
+            rate, norm = self.learner.learn(terms.total, step, self.steps)
+            values = {**{name: term.detach() for name, term in terms._asdict().items()}, "gradient": norm}
             for meter in (epoch, interval):
                 meter.add(values, optimisation.batch_size * self.processes.count, waited)
             if interval.seconds >= config.report_every:
@@ -266,7 +254,7 @@ class _Run:
     def _validate(self, validation: Validation, log: RunLog) -> dict[str, float]:
         """The numbers of the mean weights, the same in all processes; the best model so far is saved."""
         started = time.monotonic()
-        metrics: dict[str, float] = self.processes.share(validation.measure(self.mean.model))
+        metrics: dict[str, float] = self.processes.share(validation.measure(self.learner.mean))
         log.add("validation", self.epoch * self.batches_per_epoch, self.epoch, metrics)
         listed = " ".join(f"{name} {value:.3f}" for name, value in metrics.items())
         self.report(f"epoch {self.epoch} validated in {time.monotonic() - started:.0f} s: {listed}")
@@ -280,16 +268,7 @@ class _Run:
         if not self.processes.is_first:
             return
         self._save_model(LAST, metrics)
-        state = RunState(
-            config=self.config.model_dump(mode="json"),
-            processes=self.processes.count,
-            epoch=self.epoch,
-            elapsed=self.elapsed,
-            best=self.best,
-            model=self.model.state_dict(),
-            mean_model=self.mean.model.state_dict(),
-            optimizer=self.optimizer.state_dict(),
-        )
+        state = self.learner.state(self.config, self.epoch, self.elapsed, self.processes.count, self.best)
         save_state(self.folder / STATE, state)
 
     def _save_model(self, name: str, metrics: dict[str, float]) -> None:
@@ -301,7 +280,7 @@ class _Run:
             "epoch": self.epoch,
             "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
         }
-        self.mean.model.save(self.folder / name, metadata)
+        self.learner.mean.save(self.folder / name, metadata)
 
     def _distributed(self) -> nn.Module:
         if self.processes.count == 1:

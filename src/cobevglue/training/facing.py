@@ -12,16 +12,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from cobevglue.perception import PointPillars
 from cobevglue.perception.facing import FacingNet, Looks
 from cobevglue.settings import Settings
-from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
+from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
 from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
-from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, autocast, learning_rate, make_optimizer
+from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 from cobevglue.training.sources import make_source
 
@@ -133,31 +133,24 @@ def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callab
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         net = FacingNet()
-    mean, optimizer = MeanWeights(net, optimisation.mean_decay), make_optimizer(net, optimisation)
-    first, elapsed = 0, 0.0
-    if state is not None:
-        net.load_state_dict(state.model)
-        mean.model.load_state_dict(state.mean_model)
-        optimizer.load_state_dict(state.optimizer)
-        first, elapsed = state.epoch, state.elapsed
+    learner = Learner(net, optimisation, state)
+    first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     metrics: dict[str, float] = {}
     folder.mkdir(parents=True, exist_ok=True)
     steps = _steps(optimisation)
     with RunLog(folder, first * steps) as log:
         for epoch in range(first, optimisation.epochs):
             started = time.monotonic()
-            _train_epoch(config, training, net, mean, optimizer, epoch, log, report)
+            _train_epoch(config, training, learner, epoch, log, report)
             if epoch + 1 == optimisation.epochs:
-                metrics = _measure(mean.model, validation)
+                metrics = _measure(learner.mean, validation)
                 log.add("validation", (epoch + 1) * steps, epoch + 1, metrics)
                 report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
             elapsed += time.monotonic() - started
-            detector.facing.load_state_dict(mean.model.state_dict())
+            detector.facing.load_state_dict(learner.mean.state_dict())
             known = {"stage": _STAGE, "training": config.model_dump(mode="json"), "epoch": epoch + 1}
             detector.save(folder / LAST, {**provenance(), **known, "seconds": round(elapsed), "metrics": metrics})
-            states = (net.state_dict(), mean.model.state_dict(), optimizer.state_dict())
-            content = config.model_dump(mode="json")
-            save_state(folder / STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
+            save_state(folder / STATE, learner.state(config, epoch + 1, elapsed))
     return TrainingResult(folder, optimisation.epochs, True, metrics, None)
 
 
@@ -183,9 +176,7 @@ def _steps(optimisation: OptimisationConfig) -> int:
 def _train_epoch(
     config: TrainFacingConfig,
     examples: FacingExamples,
-    net: FacingNet,
-    mean: MeanWeights[FacingNet],
-    optimizer: torch.optim.Optimizer,
+    learner: Learner[FacingNet],
     epoch: int,
     log: RunLog,
     report: Callable[[str], None],
@@ -196,21 +187,14 @@ def _train_epoch(
     rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
     random = torch.Generator().manual_seed(int(rng.integers(2**63)))
     meter, whole = Meter(), Meter()
-    net.train()
+    learner.model.train()
     for step in range(epoch * per_epoch, (epoch + 1) * per_epoch):
-        rate = learning_rate(step, steps, optimisation)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
         batch = examples.take(torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size)))
         looks = augmented(batch.looks, config.augmentation, random)
         with autocast(optimisation, torch.device("cpu")):
-            logits = net(looks)
+            logits = learner.model(looks)
         loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(net.parameters(), optimisation.clip)
-        optimizer.step()
-        mean.update(net, step)
+        rate, _ = learner.learn(loss, step, steps)
         flipped = ((logits.detach() > 0) != batch.right).float().mean()
         for m in (meter, whole):
             m.add({"total": loss.detach(), "flipped": flipped}, len(logits), 0.0)

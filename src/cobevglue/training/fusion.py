@@ -21,11 +21,11 @@ from cobevglue.fusion.disconet import DiscoNet, EarlyTeacher
 from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
-from cobevglue.training.checkpoint import LAST, STATE, RunState, begin_run, provenance, save_state
+from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
-from cobevglue.training.optimisation import MeanWeights, OptimisationConfig, autocast, learning_rate, make_optimizer
+from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
 from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
 
 __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
@@ -162,14 +162,8 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
     )
 
     loss, anchors = DetectionLoss(detector.config), AnchorGrid(detector.config)
-    mean = MeanWeights(model, optimisation.mean_decay)
-    optimizer = make_optimizer(model, optimisation)
-    first, elapsed = 0, 0.0
-    if state is not None:
-        model.load_state_dict(state.model)
-        mean.model.load_state_dict(state.mean_model)
-        optimizer.load_state_dict(state.optimizer)
-        first, elapsed = state.epoch, state.elapsed
+    learner = Learner(model, optimisation, state)
+    first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     batches = optimisation.samples_per_epoch // optimisation.batch_size
     noise = config.noise if config.noise is not None else model.training_noise
     metrics: dict[str, float] = {}
@@ -184,25 +178,21 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
             seed = (config.seed, _SAMPLE_STREAM, epoch)
             merged = model.learns_from_merged_clouds
             samples = _Samples(frames, order.tolist(), noise, config.alone, merged, seed, anchors)
-            _train_epoch(config, samples, model, mean, loss, optimizer, epoch, log, report)
+            _train_epoch(config, samples, learner, loss, epoch, log, report)
             if epoch + 1 == optimisation.epochs and len(validation):
-                metrics = _validate(mean.model, validation, report)
+                metrics = _validate(learner.mean, validation, report)
                 log.add("validation", (epoch + 1) * batches, epoch + 1, metrics)
             elapsed += time.monotonic() - started
-            mean.model.save(folder / LAST, _metadata(config, epoch + 1, elapsed, metrics))
-            content = config.model_dump(mode="json")
-            states = (model.state_dict(), mean.model.state_dict(), optimizer.state_dict())
-            save_state(folder / STATE, RunState(content, 1, epoch + 1, elapsed, None, *states))
+            learner.mean.save(folder / LAST, _metadata(config, epoch + 1, elapsed, metrics))
+            save_state(folder / STATE, learner.state(config, epoch + 1, elapsed))
     return TrainingResult(folder, optimisation.epochs, True, metrics, metrics.get("ap_0.7"))
 
 
 def _train_epoch(
     config: TrainFusionConfig,
     samples: _Samples,
-    model: IntermediateFusion,
-    mean: MeanWeights[IntermediateFusion],
+    learner: Learner[IntermediateFusion],
     loss: DetectionLoss,
-    optimizer: torch.optim.Optimizer,
     epoch: int,
     log: RunLog,
     report: Callable[[str], None],
@@ -216,7 +206,7 @@ def _train_epoch(
         prefetch_factor=2 if config.workers else None,
         generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
     )
-    model.train()
+    model = learner.model.train()
     meter, whole = Meter(), Meter()
     steps = optimisation.epochs * len(loader)
     step = epoch * len(loader)
@@ -224,20 +214,13 @@ def _train_epoch(
     asked = time.monotonic()
     for items in loader:
         waited = time.monotonic() - asked
-        rate = learning_rate(step, steps, optimisation)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
         targets = collate_targets([item.targets for item in items], anchors)
         with autocast(optimisation, torch.device("cpu")):
             terms = model.loss([item.sample for item in items], targets, loss)
-        optimizer.zero_grad(set_to_none=True)
-        terms["total"].backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(model.parameters(), optimisation.clip)
-        optimizer.step()
-        mean.update(model, step)
+        rate, norm = learner.learn(terms["total"], step, steps)
         step += 1
         for m in (meter, whole):
-            m.add({**{n: t.detach() for n, t in terms.items()}, "gradient": norm.detach()}, len(items), waited)
+            m.add({**{n: t.detach() for n, t in terms.items()}, "gradient": norm}, len(items), waited)
         if meter.seconds >= config.report_every or step == (epoch + 1) * len(loader):
             numbers = {**meter.means(), "learning_rate": rate}
             if not math.isfinite(numbers["total"]):

@@ -1,4 +1,4 @@
-"""The optimiser's settings, its precision, the learning rate over the steps, and the running mean of the weights."""
+"""How weights are found: the optimiser's settings and precision, the learning rate over the steps, one step."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Annotated, Generic, Literal, TypeVar
 
 import torch
 from pydantic import Field
-from torch import nn
+from torch import Tensor, nn
 
 from cobevglue.settings import Settings
+from cobevglue.training.checkpoint import RunState
 
-__all__ = ["MeanWeights", "OptimisationConfig", "autocast", "learning_rate", "make_optimizer"]
+__all__ = ["Learner", "MeanWeights", "OptimisationConfig", "autocast", "learning_rate", "make_optimizer"]
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -102,3 +103,61 @@ class MeanWeights(Generic[Model]):
         torch._foreach_lerp_([ours[n] for n in floating], [theirs[n] for n in floating], 1.0 - decay)
         for name in ours.keys() - set(floating):
             ours[name].copy_(theirs[name])
+
+
+class Learner(Generic[Model]):
+    """A model, the running mean of its weights, and its optimiser.
+
+    Attributes:
+        model: what is trained.
+        mean: what is validated and saved.
+    """
+
+    def __init__(self, model: Model, config: OptimisationConfig, state: RunState | None = None) -> None:
+        """Start from the model as it is, or from where a run was left.
+
+        Args:
+            model: what to train.
+            config: how.
+            state: of the run to go on with.
+        """
+        self.model, self._config = model, config
+        if state is not None:
+            model.load_state_dict(state.model)
+        self._mean = MeanWeights(model, config.mean_decay)
+        self.mean = self._mean.model
+        self._optimizer = make_optimizer(model, config)
+        if state is not None:
+            self.mean.load_state_dict(state.mean_model)
+            self._optimizer.load_state_dict(state.optimizer)
+
+    def learn(self, loss: Tensor, step: int, steps: int) -> tuple[float, Tensor]:
+        """Step `step` (from 0) of `steps`, down the gradient of a loss.
+
+        Returns:
+            The learning rate, and the length of the gradient before it was clipped.
+        """
+        rate = learning_rate(step, steps, self._config)
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self._config.clip)
+        self._optimizer.step()
+        self._mean.update(self.model, step)
+        return rate, norm.detach()
+
+    def state(
+        self, config: Settings, epoch: int, elapsed: float, processes: int = 1, best: float | None = None
+    ) -> RunState:
+        """What is needed to go on later; see `RunState`."""
+        return RunState(
+            config=config.model_dump(mode="json"),
+            processes=processes,
+            epoch=epoch,
+            elapsed=elapsed,
+            best=best,
+            model=self.model.state_dict(),
+            mean_model=self.mean.state_dict(),
+            optimizer=self._optimizer.state_dict(),
+        )
