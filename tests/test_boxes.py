@@ -208,6 +208,16 @@ def test_concatenate_drops_a_field_that_one_part_lacks_and_refuses_a_repeated_id
         Boxes.concatenate([good()[0], good()[0]])
 
 
+def test_some_are_turned_round_and_the_others_stay_as_they_are() -> None:
+    yaw = [0.1, -3.0, 7.0, math.pi]
+    boxes = Boxes(np.zeros((4, 3)), np.ones((4, 3)), yaw, score=[0.1, 0.2, 0.3, 0.4])
+    turned = boxes.turned_round([True, True, False, False])
+    assert turned.yaw.tolist() == pytest.approx([0.1 - math.pi, math.pi - 3.0, 7.0, math.pi], abs=1e-12)
+    assert turned.yaw[2:].tolist() == yaw[2:]
+    assert turned.score is not None
+    assert turned.score.tolist() == [0.1, 0.2, 0.3, 0.4]
+
+
 def test_transform_moves_centres_and_headings_and_nothing_else() -> None:
     moved = good().transform(SE2(10, 0, math.pi / 2))
     np.testing.assert_allclose(moved.center, [[8, 1, 0], [6, 3, 0], [4, 5, 0]], atol=1e-12)

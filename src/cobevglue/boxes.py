@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from cobevglue.se2 import SE2
+from cobevglue.se2 import SE2, wrap_angle
 from cobevglue.typing import ArrayLike, BoolArray, FloatArray, IntArray, StrArray
 
-__all__ = ["Boxes", "covers_origin"]
+__all__ = ["Boxes", "covers_origin", "local_coordinates"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -103,6 +103,10 @@ class Boxes:
         """(N, 5) x, y, length, width, yaw: the boxes seen from above."""
         return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
 
+    def turned_round(self, which: ArrayLike) -> Boxes:
+        """These boxes, those that `which` (N,) is True for turned by 180 degrees, with headings in [-pi, pi)."""
+        return self.replace(yaw=np.where(which, wrap_angle(self.yaw + np.pi), self.yaw))
+
     def bev_corners(self) -> FloatArray:
         """(N, 4, 2) corners seen from above, counter-clockwise from front left [m]."""
         half = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]) * self.size[:, None, :2]
@@ -118,6 +122,19 @@ def covers_origin(boxes: Boxes) -> BoolArray:
     x, y = boxes.center[:, 0], boxes.center[:, 1]
     covers: BoolArray = (2 * abs(c * x + s * y) < boxes.size[:, 0]) & (2 * abs(c * y - s * x) < boxes.size[:, 1])
     return covers
+
+
+def local_coordinates(points: ArrayLike, center: ArrayLike, yaw: ArrayLike) -> FloatArray:
+    """(N, 3) points as seen from a box, or each from its own: x along the heading, y to the left, from the centre [m].
+
+    Args:
+        points: (N, 3) x, y, z [m].
+        center: (3,) or (N, 3), the boxes' [m].
+        yaw: scalar or (N,), the boxes' [rad].
+    """
+    offset = np.asarray(points, dtype=np.float64) - center
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.column_stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]])
 
 
 def _set(boxes: Boxes, name: str, value: FloatArray | IntArray | StrArray | None) -> None:

@@ -34,10 +34,12 @@ def test_points_in_a_box(
 def test_points_at_a_box_come_in_its_axes_and_at_any_height() -> None:
     points = np.array([[10, 1.5, 7, 0], [8.95, 0, 0, 0], [8.4, 0, 0, 0], [50, 0, 0, 0]], dtype=np.float32)
     across = Boxes([(10, 0, 1)], [(4, 2, 1.5)], [math.pi / 2])  # faces along y
-    (found,) = points_at(points, across)
+    ((rows, found),) = points_at(points, across)
     np.testing.assert_allclose(found, [(1.5, 0, 6)], atol=1e-6)
-    (found,) = points_at(points, across, margin=0.1)
+    assert rows.tolist() == [0]
+    ((rows, found),) = points_at(points, across, margin=0.1)
     np.testing.assert_allclose(found, [(0, 1.05, -1), (1.5, 0, 6)], atol=1e-6)
+    assert rows.tolist() == [1, 0]
 
 
 def test_no_points_and_no_boxes() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cobevglue.boxes import Boxes
+from cobevglue.boxes import Boxes, local_coordinates
 from cobevglue.typing import Float32Array, FloatArray, IntArray
 
 __all__ = ["LabelledCloud", "count_points", "points_at"]
@@ -37,7 +37,7 @@ class LabelledCloud:
             raise ValueError(f"point_count must have shape ({len(self.boxes)},), got {self.point_count.shape}")
 
 
-def points_at(points: Float32Array, boxes: Boxes, margin: float = 0.0) -> Iterator[FloatArray]:
+def points_at(points: Float32Array, boxes: Boxes, margin: float = 0.0) -> Iterator[tuple[IntArray, FloatArray]]:
     """For each box the points that it holds seen from above, its edge included, at any height.
 
     Args:
@@ -46,19 +46,19 @@ def points_at(points: Float32Array, boxes: Boxes, margin: float = 0.0) -> Iterat
         margin: by how much boxes are enlarged on every side [m].
 
     Yields:
-        (n, 3) x, y, z [m] from the box's centre, x along its heading.
+        (n,) rows of these points, and (n, 3) x, y, z [m] from the box's centre, x along its heading.
     """
-    ordered = points[np.argsort(points[:, 0])]  # so that a box looks only at the slab of points that it spans in x
+    order = np.argsort(points[:, 0])  # so that a box looks only at the slab of points that it spans in x
+    x, y = points[order, 0], points[order, 1]
     reach = np.hypot(boxes.size[:, 0] / 2.0 + margin, boxes.size[:, 1] / 2.0 + margin)
-    first = np.searchsorted(ordered[:, 0], boxes.center[:, 0] - reach, side="left")
-    last = np.searchsorted(ordered[:, 0], boxes.center[:, 0] + reach, side="right")
+    first = np.searchsorted(x, boxes.center[:, 0] - reach, side="left")
+    last = np.searchsorted(x, boxes.center[:, 0] + reach, side="right")
     for row in range(len(boxes)):
-        offset = ordered[first[row] : last[row], :3] - boxes.center[row]
-        c, s = np.cos(boxes.yaw[row]), np.sin(boxes.yaw[row])
-        along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-        length, width = boxes.size[row, :2] / 2.0 + margin
-        inside = (np.abs(along) <= length) & (np.abs(across) <= width)
-        yield np.column_stack([along[inside], across[inside], offset[inside, 2]])
+        slab = slice(first[row], last[row])
+        near = order[slab][np.abs(y[slab] - boxes.center[row, 1]) <= reach[row]]
+        local = local_coordinates(points[near, :3], boxes.center[row], boxes.yaw[row])
+        inside = (np.abs(local[:, :2]) <= boxes.size[row, :2] / 2.0 + margin).all(axis=1)
+        yield near[inside], local[inside]
 
 
 def count_points(points: Float32Array, boxes: Boxes) -> IntArray:
@@ -72,7 +72,7 @@ def count_points(points: Float32Array, boxes: Boxes) -> IntArray:
         (K,) counts.
     """
     counts = np.zeros(len(boxes), dtype=np.int64)
-    for row, inside in enumerate(points_at(points, boxes)):
+    for row, (_, inside) in enumerate(points_at(points, boxes)):
         height = boxes.size[row, 2] / 2.0
         counts[row] = np.count_nonzero(np.abs(inside[:, 2]) <= height) if height > 0.0 else len(inside)
     return counts

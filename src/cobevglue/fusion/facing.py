@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.iou import bev_iou
-from cobevglue.se2 import wrap_angle
 
 __all__ = ["face_as_told"]
 
@@ -32,4 +30,4 @@ def face_as_told(boxes: Boxes, told: Iterable[Boxes]) -> Boxes:
         overlap = bev_iou(boxes, one)
         weight = np.where(overlap >= _SAME_OBJECT, overlap, 0.0) * (1.0 if one.score is None else one.score)
         vote += (weight * np.sign(np.cos(boxes.yaw[:, None] - one.yaw))).sum(axis=1)
-    return boxes.replace(yaw=np.where(vote < 0.0, wrap_angle(boxes.yaw + math.pi), boxes.yaw))
+    return boxes.turned_round(vote < 0.0)

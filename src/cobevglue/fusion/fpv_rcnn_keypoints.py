@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cobevglue.boxes import Boxes
-from cobevglue.fusion.fpv_rcnn_proposals import local_coordinates
+from cobevglue.datasets.labelled_cloud import points_at
 from cobevglue.typing import BoolArray, Float32Array, IntArray
 
 __all__ = ["select_keypoints", "spread"]
@@ -52,15 +52,7 @@ def spread(points: Float32Array, budget: int) -> IntArray:
 
 def _in_any(points: Float32Array, boxes: Boxes, margin: float) -> BoolArray:
     """(N,) whether a point is in any of the boxes, enlarged by a margin [m]."""
-    order = np.argsort(points[:, 0])  # so that a box looks only at the slab of points that it spans in x
-    ordered = points[order, :3]
-    half = boxes.size / 2.0 + margin
-    reach = np.hypot(half[:, 0], half[:, 1])
-    first = np.searchsorted(ordered[:, 0], boxes.center[:, 0] - reach, side="left")
-    last = np.searchsorted(ordered[:, 0], boxes.center[:, 0] + reach, side="right")
     inside = np.zeros(len(points), dtype=bool)
-    for row in range(len(boxes)):
-        slab = slice(first[row], last[row])
-        local = local_coordinates(ordered[slab], boxes.center[row], boxes.yaw[row])
-        inside[order[slab]] |= (np.abs(local) <= half[row]).all(axis=1)
+    for row, (at, local) in enumerate(points_at(points, boxes, margin)):
+        inside[at[np.abs(local[:, 2]) <= boxes.size[row, 2] / 2.0 + margin]] = True
     return inside

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from cobevglue.boxes import Boxes
+from cobevglue.boxes import Boxes, local_coordinates
 from cobevglue.iou import bev_iou
 from cobevglue.se2 import wrap_angle
-from cobevglue.typing import ArrayLike, FloatArray, IntArray
+from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["decode_refinement", "encode_refinement", "local_coordinates", "merge_proposals"]
+__all__ = ["decode_refinement", "encode_refinement", "merge_proposals"]
 
 _LARGEST = 1.0
 """Refinements of size are cut here: a second look makes no box more than e times larger."""
@@ -91,16 +91,3 @@ def decode_refinement(refinement: FloatArray, proposals: Boxes) -> Boxes:
         size=proposals.size * np.exp(np.clip(refinement[:, 3:6], -_LARGEST, _LARGEST)),
         yaw=wrap_angle(proposals.yaw + refinement[:, 6]),
     )
-
-
-def local_coordinates(points: ArrayLike, center: ArrayLike, yaw: ArrayLike) -> FloatArray:
-    """(N, 3) points as seen from a box, or each from its own: x along the heading, y to the left, from the centre [m].
-
-    Args:
-        points: (N, 3) x, y, z [m].
-        center: (3,) or (N, 3), the boxes' [m].
-        yaw: scalar or (N,), the boxes' [rad].
-    """
-    offset = np.asarray(points, dtype=np.float64) - center
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]])

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from cobevglue.datasets.labelled_cloud import points_at
 from cobevglue.perception.decode import Found
-from cobevglue.se2 import wrap_angle
 from cobevglue.typing import Float32Array
 
 __all__ = ["FacingNet", "Looks", "face", "look_at"]
@@ -62,7 +61,7 @@ def look_at(points: Float32Array, found: Found) -> Looks:
     assert boxes.score is not None
     taken = np.zeros((len(boxes), _POINTS, 3), dtype=np.float32)
     number = np.zeros(len(boxes), dtype=np.int64)
-    for row, at in enumerate(points_at(points, boxes, _MARGIN)):
+    for row, (_, at) in enumerate(points_at(points, boxes, _MARGIN)):
         half = boxes.size[row, 2] / 2.0
         on = at[(at[:, 2] >= -half - _BELOW) & (at[:, 2] <= half + _ABOVE)]
         number[row] = len(on)
@@ -159,5 +158,4 @@ def face(found: Found, points: Float32Array, net: FacingNet) -> Found:
         return found
     device = next(net.parameters()).device
     logits = net(Looks(*(t.to(device) for t in look_at(points, found)))).double().cpu().numpy()
-    yaw = wrap_angle(found.boxes.yaw + math.pi * (logits < 0.0))
-    return found._replace(boxes=found.boxes.replace(yaw=yaw), sure=np.tanh(np.abs(logits) / 2.0))
+    return found._replace(boxes=found.boxes.turned_round(logits < 0.0), sure=np.tanh(np.abs(logits) / 2.0))

@@ -14,7 +14,7 @@ from cobevglue.boxes import Boxes
 from cobevglue.perception.level import lifted, needed_raise
 from cobevglue.perception.point_pillars import PointPillars, check_points
 from cobevglue.tracking import Sort
-from cobevglue.typing import ArrayLike, BoolArray, Float32Array, FloatArray
+from cobevglue.typing import ArrayLike, Float32Array, FloatArray
 
 __all__ = ["Perception", "PerceptionOutput"]
 
@@ -94,7 +94,9 @@ class Perception:
             assert detections.score is not None
             good = detections.score >= self.min_track_score
             tracked = self.tracker.faced(self.tracker.update(detections[good], time, sure[good]))
-            detections = detections.replace(yaw=_put(detections.yaw, good, tracked.yaw))
+            yaw = detections.yaw.copy()
+            yaw[good] = tracked.yaw
+            detections = detections.replace(yaw=yaw)
         features = (first[0], second[0], third[0])
         return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
 
@@ -105,10 +107,3 @@ class Perception:
         if self.detector.device.type == "cuda":  # which answers before it is done
             torch.cuda.synchronize(self.detector.device)
         seconds[stage] = perf_counter() - start
-
-
-def _put(values: FloatArray, rows: BoolArray, new: FloatArray) -> FloatArray:
-    """A copy with other values in some rows."""
-    result = values.copy()
-    result[rows] = new
-    return result
