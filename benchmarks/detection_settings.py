@@ -20,8 +20,6 @@ from cobevglue.evaluation.detection_data import Cloud, simulated_clouds
 from cobevglue.evaluation.detection_matching import DetectionFrame
 from cobevglue.perception import PointPillars
 from cobevglue.perception.config import DetectionConfig
-from cobevglue.perception.decode import decode
-from cobevglue.perception.facing import face
 from cobevglue.perception.head import HeadOutput
 from cobevglue.simulation.episodes import SimulatedEpisodes
 
@@ -53,9 +51,9 @@ def main() -> None:
     parser.add_argument("--weights", default="compact", help="a shipped name, or a .safetensors file")
     parser.add_argument("--clouds", type=int, default=120)
     arguments = parser.parse_args()
-    name = str(arguments.weights)
-    detector = PointPillars.named(name)
-    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {name}\n")
+    detector = PointPillars.named(arguments.weights)
+    usual = detector.detection
+    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
     seen: list[tuple[Cloud, HeadOutput]] = []
     with torch.inference_mode():
         for cloud in simulated_clouds(SimulatedEpisodes("validation"), arguments.clouds):
@@ -63,8 +61,8 @@ def main() -> None:
             seen.append((cloud, detector([torch.from_numpy(cloud.points)])))
     print("| change | AP 0.5 | AP 0.7 | flipped |\n|---|---|---|---|")
     for change in CHANGES:
-        settings = DetectionConfig.model_validate({**detector.detection.model_dump(), **change})
-        frames = [frame(cloud, output, detector, settings) for cloud, output in seen]
+        detector.detection = DetectionConfig.model_validate({**usual.model_dump(), **change})
+        frames = [frame(cloud, output, detector) for cloud, output in seen]
         report = evaluate_detections(frames, evaluation_range=RANGE, min_points=MIN_POINTS)
         print(
             f"| {change or 'as it is'} | {report.ap(0.5):.4f} | {report.ap(0.7):.4f} | {report.errors.flipped:.3f} |",
@@ -72,13 +70,12 @@ def main() -> None:
         )
 
 
-def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars, settings: DetectionConfig) -> DetectionFrame:
-    """What these settings make of the network's output."""
+def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars) -> DetectionFrame:
+    """What the detector's settings make of its network's output."""
     assert cloud.points is not None
-    (found,) = decode(output, detector.anchors, settings)
-    if settings.second_look:
-        found = face(found, cloud.points, detector.facing)
-    return DetectionFrame(found.boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
+    (found,) = detector.boxes(output)
+    boxes = detector.faced(found, cloud.points).boxes
+    return DetectionFrame(boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
 
 
 if __name__ == "__main__":

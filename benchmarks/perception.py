@@ -16,6 +16,7 @@ Thresholds of detection were chosen on the simulated validation split.
 from __future__ import annotations
 
 import argparse
+import copy
 import os
 import platform
 import resource
@@ -57,8 +58,7 @@ def main() -> None:
     arguments = parser.parse_args()
     data = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parent.parent.parent / "shared" / "data")) / "opv2v"
     print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
-    name = str(arguments.weights)
-    detector = PointPillars.named(name)
+    detector = PointPillars.named(arguments.weights)
     wanted = (arguments.only,) if arguments.only else PARTS
     if "real" in wanted:
         real(detector, data)
@@ -114,32 +114,27 @@ def headings(detector: PointPillars, data: Path, split: str) -> None:
     """Which share of true positives (IoU 0.5, score >= 0.3) is the wrong way round, in drives at 10 Hz."""
     print("\n## Headings\n\n| clouds | true positives | head alone | second look | and tracked | head, tracked |")
     print("|---|---|---|---|---|---|")
-    once = PointPillars(detector.config)
-    once.load_state_dict(detector.state_dict())
-    once.eval().detection = detector.detection.model_copy(update={"second_look": False})
+    once = copy.deepcopy(detector)
+    once.detection = detector.detection.model_copy(update={"second_look": False})
     drives = {
         f"OPV2V {SCENARIO}": [OPV2V(data, "test_culvercity")[SCENARIO]],
         f"simulated {split} split, {DRIVES} drives": simulated_scenarios(split, DRIVES, settings=DRIVE),
     }
     for name, scenarios in drives.items():
-        seen: dict[str, list[DetectionFrame]] = {"once": [], "twice": [], "tracked": [], "once, tracked": []}
+        seen: dict[str, list[DetectionFrame]] = {"once": [], "twice": [], "twice, tracked": [], "once, tracked": []}
         for scenario in scenarios:
-            perceivers: dict[tuple[str, bool], Perception] = {}
+            perceivers: dict[tuple[str, str], Perception] = {}
             for cloud in dataset_clouds([scenario]):
                 if cloud.points is None:
                     continue
-                for kind, one in (("once", once), ("twice", detector)):
-                    seen[kind].append(detect(cloud, one))
-                    perceiver = perceivers.setdefault((cloud.agent, one is detector), Perception(one))
-                    boxes = perceiver.step(cloud.points).boxes
-                    tracked = "tracked" if one is detector else "once, tracked"
-                    seen[tracked].append(replace(seen[kind][-1], detections=boxes, detection_point_count=None))
-        errors = {
-            kind: evaluate_detections(frames, evaluation_range=RANGE, min_points=1).errors
-            for kind, frames in seen.items()
-        }
-        cells = [f"{errors[kind].flipped:.1%}" for kind in ("once", "twice", "tracked", "once, tracked")]
-        print(f"| {name} | {errors['twice'].count} | " + " | ".join(cells) + " |", flush=True)
+                for look, one in (("once", once), ("twice", detector)):
+                    alone = detect(cloud, one)
+                    tracked = perceivers.setdefault((cloud.agent, look), Perception(one)).step(cloud.points).boxes
+                    seen[look].append(alone)
+                    seen[f"{look}, tracked"].append(replace(alone, detections=tracked, detection_point_count=None))
+        errors = [evaluate_detections(f, evaluation_range=RANGE, min_points=1).errors for f in seen.values()]
+        cells = [name, str(errors[1].count), *(f"{one.flipped:.1%}" for one in errors)]
+        print("| " + " | ".join(cells) + " |", flush=True)
 
 
 def alignment(detector: PointPillars, data: Path) -> None:

@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
 
 from cobevglue.alignment import group_aligner
 from cobevglue.boxes import Boxes
@@ -33,6 +32,7 @@ from cobevglue.simulation.road_network import RoadNetwork
 from cobevglue.simulation.scenario import ScenarioSettings, SimulatedScenario
 from cobevglue.simulation.world import LidarView
 from cobevglue.system import CoBEVGlue, StepOutput
+from cobevglue.torch_threads import torch_threads
 from cobevglue.typing import BoolArray, Float32Array, FloatArray, IntArray
 
 __all__ = [
@@ -340,13 +340,8 @@ def _workers() -> Iterator[Executor]:
 
     Meanwhile the network is not spread over threads of its own: on a busy machine they mostly wait for each other.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(min(_WORKERS_AT_MOST, os.cpu_count() or 1)) as workers:
-            yield workers
-    finally:
-        torch.set_num_threads(before)
+    with torch_threads(1), ThreadPoolExecutor(min(_WORKERS_AT_MOST, os.cpu_count() or 1)) as workers:
+        yield workers
 
 
 def _scene(

@@ -118,9 +118,7 @@ def _load_detector(weights: str) -> PointPillars:
         raise InputError(str(error)) from error
     import torch
 
-    is_file = weights.endswith(".safetensors")
-    detector = PointPillars.load(weights) if is_file else PointPillars.pretrained(weights)
-    return detector.to("cuda" if torch.cuda.is_available() else "cpu")
+    return PointPillars.named(weights).to("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _evaluation_range(task: DetectTask, detector: PointPillars) -> EvaluationRange:

@@ -38,8 +38,7 @@ class Models:
 
     def __init__(self, settings: StudySettings) -> None:
         self._settings = settings
-        name = settings.detector
-        detector = PointPillars.named(name)
+        detector = PointPillars.named(settings.detector)
         self.detector = detector.to("cuda" if torch.cuda.is_available() else "cpu")
         self._methods: dict[str, FusionMethod] = {}
         self._fingerprints: dict[str, str] = {}

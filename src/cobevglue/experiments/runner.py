@@ -22,6 +22,7 @@ from cobevglue.experiments.models import Models
 from cobevglue.experiments.results import ConditionResult, ScenarioResult, read_result, write_result
 from cobevglue.experiments.run import PERCEPTION_COST, run_drive
 from cobevglue.experiments.study import StudySettings, drive_names, open_drive
+from cobevglue.torch_threads import torch_threads
 
 __all__ = ["run_study"]
 
@@ -130,12 +131,8 @@ _Results = Iterator[tuple[_Job, ScenarioResult]]
 
 def _run_here(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
     """In this process."""
-    import torch
-
     total, done = _work_of(jobs), 0.0
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums do not depend on how many there are
-    try:
+    with torch_threads(1):  # sums do not depend on how many there are
         for job in jobs:
             finished = [done]
 
@@ -145,8 +142,6 @@ def _run_here(jobs: Sequence[_Job], workers: int, models: Models, progress: _Pro
 
             yield job, _run(job, models, report)
             done = finished[0]
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _run_in_processes(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:

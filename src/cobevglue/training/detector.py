@@ -14,6 +14,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from cobevglue.perception import DetectionLoss, PointPillars
+from cobevglue.torch_threads import torch_threads
 from cobevglue.training.batches import Batch, Batches
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
@@ -88,14 +89,9 @@ def train_detector(
     source = source or make_source(config.data, config.seed, validation=False)
     if config.validation.episodes and validation_source is None:
         validation_source = make_source(config.data, config.seed, validation=True)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.threads)
-    try:
-        with process_group(config.device) as processes:
-            run = _Run(config, folder, processes, resume, report if processes.is_first else lambda _: None)
-            return run.train(source, validation_source, max_minutes)
-    finally:
-        torch.set_num_threads(threads)
+    with torch_threads(config.threads), process_group(config.device) as processes:
+        run = _Run(config, folder, processes, resume, report if processes.is_first else lambda _: None)
+        return run.train(source, validation_source, max_minutes)
 
 
 class _Run:

@@ -17,6 +17,7 @@ from torch import Tensor
 from cobevglue.perception import PointPillars
 from cobevglue.perception.facing import FacingNet, Looks
 from cobevglue.settings import Settings
+from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
@@ -113,12 +114,8 @@ def train_facing(
         FileNotFoundError: nothing to resume, or no such weights or data.
         DivergedError: the loss is not finite any more.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.threads)
-    try:
+    with torch_threads(config.threads):
         return _train(config, folder, resume, report)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:

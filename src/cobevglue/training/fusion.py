@@ -21,6 +21,7 @@ from cobevglue.fusion.disconet import DiscoNet, EarlyTeacher
 from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
+from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import DivergedError, TrainingResult
@@ -143,12 +144,8 @@ def train_fusion(
         FileNotFoundError: nothing to resume, or no such weights.
         DivergedError: the loss is not finite any more.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.threads)
-    try:
+    with torch_threads(config.threads):
         return _train(config, folder, resume, report)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
