@@ -8,6 +8,7 @@ import pytest
 from cobevglue.simulation.lidar import LidarSettings, RayScene
 from cobevglue.simulation.mesh import Mesh
 from cobevglue.simulation.traffic import VEHICLE_KINDS as TRAFFIC_KINDS
+from cobevglue.simulation.vehicle_bodies import BODIES, Body, varied
 from cobevglue.simulation.vehicle_shapes import VEHICLE_KINDS, vehicle_mesh
 from cobevglue.typing import Float32Array
 
@@ -52,12 +53,35 @@ def test_bounds_are_the_box(kind: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sedan", "hatchback", "suv", "jeep", "pickup", "van"])
-def test_bonnets_are_lower_than_roofs_so_that_front_and_rear_differ(kind: str) -> None:
-    mesh = vehicle_mesh(kind, SIZES[kind], rng())
+@pytest.mark.parametrize("seed", range(8))
+def test_bonnets_are_lower_than_roofs_so_that_front_and_rear_differ(kind: str, seed: int) -> None:
     length, _, height = SIZES[kind]
-    front, roof = heights_along(mesh, np.array([0.42 * length, 0.0 * length], dtype=np.float32))
-    assert roof > 0.9 * height
-    assert front < 0.75 * height
+    mesh = vehicle_mesh(kind, SIZES[kind], rng(seed))
+    heights = heights_along(mesh, np.array([-0.15, -0.05, 0.05, 0.1, 0.475], dtype=np.float32) * length)
+    assert heights[:4].max() > 0.9 * height
+    assert heights[4] < 0.75 * height
+
+
+@pytest.mark.parametrize(("kind", "body"), [(kind, body) for kind, bodies in BODIES.items() for body in bodies])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_varied_body_keeps_the_order_of_its_parts(kind: str, body: Body, seed: int) -> None:
+    changed = varied(body, rng(seed))
+    along, shoulder, roof, plan = np.array(changed.stations).T
+    assert along[0] == 0.0
+    assert along[-1] == pytest.approx(1.0)
+    assert (np.diff(along) > 0.0).all()
+    assert 0.0 < changed.axles[0] < changed.axles[-1] < 1.0
+    for share in (shoulder, roof, plan):
+        assert ((share > 0.0) & (share <= 1.0)).all()
+    assert not np.allclose(along, np.array(body.stations)[:, 0])
+
+
+def test_every_body_has_windows() -> None:
+    """Mirrors stand beside the foremost, and seats are seen through them."""
+    for bodies in BODIES.values():
+        for body in bodies:
+            _, shoulder, roof, _ = np.array(body.stations).T
+            assert (roof - shoulder).max() > 0.2
 
 
 @pytest.mark.parametrize("kind", [kind for kind in VEHICLE_KINDS if kind != "motorcycle"])
