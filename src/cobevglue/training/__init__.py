@@ -10,11 +10,12 @@
 
 from cobevglue.training.augmentation import AugmentationConfig, augment
 from cobevglue.training.config import PRESETS, DataConfig, TrainDetectorConfig, ValidationConfig, load_config
-from cobevglue.training.detector import DivergedError, TrainingResult, train_detector
+from cobevglue.training.detector import TrainingResult, train_detector
 from cobevglue.training.facing import FACING_PRESETS, TrainFacingConfig, load_facing_config, train_facing
 from cobevglue.training.fusion import FUSION_PRESETS, TrainFusionConfig, load_fusion_config, train_fusion
 from cobevglue.training.fusion_features import FeatureConfig
 from cobevglue.training.optimisation import OptimisationConfig
+from cobevglue.training.progress import DivergedError
 from cobevglue.training.samples import DatasetEpisodes, EpisodeSource
 
 __all__ = [

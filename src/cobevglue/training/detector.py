@@ -20,19 +20,16 @@ from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, sa
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
 from cobevglue.training.optimisation import Learner, autocast
 from cobevglue.training.processes import Processes, process_group
-from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
+from cobevglue.training.progress import EpochProgress
+from cobevglue.training.run_log import RunLog, print_progress
 from cobevglue.training.samples import EpisodeSource
 from cobevglue.training.sources import make_source
 from cobevglue.training.stream import EpisodeStream
 from cobevglue.training.validation import Validation
 
-__all__ = ["DivergedError", "TrainingResult", "train_detector"]
+__all__ = ["TrainingResult", "train_detector"]
 
 BEST = "best.safetensors"
-
-
-class DivergedError(RuntimeError):
-    """The loss is no number any more."""
 
 
 @dataclass(frozen=True)
@@ -107,13 +104,7 @@ class _Run:
     ) -> None:
         self.config, self.folder, self.processes, self.report = config, folder, processes, report
         optimisation = config.optimisation
-        self.batches_per_epoch = optimisation.samples_per_epoch // (optimisation.batch_size * processes.count)
-        if self.batches_per_epoch == 0:
-            raise ValueError(
-                f"optimisation.samples_per_epoch: {optimisation.samples_per_epoch} samples are no full batch of "
-                f"{optimisation.batch_size} for each of {processes.count} processes"
-            )
-        self.steps = optimisation.epochs * self.batches_per_epoch
+        self.batches_per_epoch = optimisation.steps_per_epoch(processes.count)
 
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
@@ -203,49 +194,20 @@ class _Run:
         )
 
     def _train_epoch(self, batches: Iterator[Batch], log: RunLog) -> None:
-        config, optimisation, device = self.config, self.config.optimisation, self.processes.device
+        config, optimisation, processes = self.config, self.config.optimisation, self.processes
+        progress = EpochProgress(
+            optimisation, self.epoch, log, self.report, every=config.report_every, processes=processes.count
+        )
         self.net.train()
-        epoch, interval = Meter(), Meter()
-        first = self.epoch * self.batches_per_epoch
-        for step in range(first, first + self.batches_per_epoch):
+        for step in progress.steps:
             asked = time.monotonic()
             batch = next(batches)
             waited = time.monotonic() - asked
-            with autocast(optimisation, device):
-                output = self.net(batch.clouds(device))
-            terms = self.loss(output, batch.targets.to(device))
-            rate, norm = self.learner.learn(terms.total, step, self.steps)
-            values = {**{name: term.detach() for name, term in terms._asdict().items()}, "gradient": norm}
-            for meter in (epoch, interval):
-                meter.add(values, optimisation.batch_size * self.processes.count, waited)
-            if interval.seconds >= config.report_every:
-                numbers = self._numbers(interval, step, rate)
-                log.add("train", step + 1, self.epoch, numbers)
-                self.report(self._progress(step + 1, numbers))
-                interval = Meter()
-        numbers = self._numbers(epoch, step, rate)
-        log.add("epoch", step + 1, self.epoch, numbers)
-        self.report(self._progress(step + 1, numbers))
-
-    def _numbers(self, meter: Meter, step: int, rate: float) -> dict[str, float]:
-        numbers = meter.means()
-        if not math.isfinite(numbers["total"]):
-            raise DivergedError(
-                f"the loss is {numbers['total']} at step {step + 1}; the state of epoch {self.epoch} is kept. Lower "
-                f"optimisation.learning_rate or optimisation.clip"
-            )
-        return {**numbers, "learning_rate": rate}
-
-    def _progress(self, step: int, numbers: dict[str, float]) -> str:
-        hidden = ("learning_rate", "samples_per_second", "waiting")
-        terms = " ".join(f"{name} {value:.3f}" for name, value in numbers.items() if name not in hidden)
-        samples = (self.steps - step) * self.config.optimisation.batch_size * self.processes.count
-        return (
-            f"epoch {self.epoch + 1}/{self.config.optimisation.epochs} step {step}/{self.steps}: {terms}, "
-            f"lr {numbers['learning_rate']:.1e}, {numbers['samples_per_second']:.1f} samples/s "
-            f"({100 * numbers['waiting']:.0f} % waiting for data), "
-            f"{duration(samples / numbers['samples_per_second'])} left"
-        )
+            with autocast(optimisation, processes.device):
+                output = self.net(batch.clouds(processes.device))
+            terms = self.loss(output, batch.targets.to(processes.device))
+            rate, norm = self.learner.learn(terms.total, step, progress.all_steps)
+            progress.add({**terms._asdict(), "gradient": norm}, rate, waited)
 
     def _validate(self, validation: Validation, log: RunLog) -> dict[str, float]:
         """The numbers of the mean weights, the same in all processes; the best model so far is saved."""

@@ -20,10 +20,11 @@ from cobevglue.settings import Settings
 from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
-from cobevglue.training.detector import DivergedError, TrainingResult
+from cobevglue.training.detector import TrainingResult
 from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
-from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
+from cobevglue.training.progress import EpochProgress
+from cobevglue.training.run_log import RunLog, print_progress
 from cobevglue.training.sources import make_source
 
 __all__ = [
@@ -49,6 +50,8 @@ class FacingAugmentation(Settings):
         thinning: up to this share of the points on a vehicle is dropped.
         jitter: standard deviation by which each point is moved along each axis [m].
         stretch: a vehicle's points are stretched along each axis by a factor between 1 - this and 1 + this.
+        bend: its parts are shifted along it by waves of this deviation, in shares of its length, and raised in front
+            or behind by this deviation, in shares of its height.
         alone: share of vehicles around which no other is seen.
         unsure: share of vehicles of which the head's opinion is not known.
     """
@@ -56,6 +59,7 @@ class FacingAugmentation(Settings):
     thinning: _Share = 0.7
     jitter: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
     stretch: _Share = 0.06
+    bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
     alone: _Share = 0.2
     unsure: _Share = 0.2
 
@@ -134,7 +138,7 @@ def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callab
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     metrics: dict[str, float] = {}
     folder.mkdir(parents=True, exist_ok=True)
-    steps = _steps(optimisation)
+    steps = optimisation.steps_per_epoch()
     with RunLog(folder, first * steps) as log:
         for epoch in range(first, optimisation.epochs):
             started = time.monotonic()
@@ -166,10 +170,6 @@ def _examples(
     return write_facing_examples(config.examples / split, source, described, detector, config.threads, report)
 
 
-def _steps(optimisation: OptimisationConfig) -> int:
-    return max(optimisation.samples_per_epoch // optimisation.batch_size, 1)
-
-
 def _train_epoch(
     config: TrainFacingConfig,
     examples: FacingExamples,
@@ -179,33 +179,19 @@ def _train_epoch(
     report: Callable[[str], None],
 ) -> None:
     optimisation = config.optimisation
-    per_epoch = _steps(optimisation)
-    steps = optimisation.epochs * per_epoch
+    progress = EpochProgress(optimisation, epoch, log, report, every=config.report_every)
     rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
     random = torch.Generator().manual_seed(int(rng.integers(2**63)))
-    meter, whole = Meter(), Meter()
     learner.model.train()
-    for step in range(epoch * per_epoch, (epoch + 1) * per_epoch):
+    for step in progress.steps:
         batch = examples.take(torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size)))
         looks = augmented(batch.looks, config.augmentation, random)
         with autocast(optimisation, torch.device("cpu")):
             logits = learner.model(looks)
         loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
-        rate, _ = learner.learn(loss, step, steps)
+        rate, _ = learner.learn(loss, step, progress.all_steps)
         flipped = ((logits.detach() > 0) != batch.right).float().mean()
-        for m in (meter, whole):
-            m.add({"total": loss.detach(), "flipped": flipped}, len(logits), 0.0)
-        if meter.seconds >= config.report_every or step + 1 == (epoch + 1) * per_epoch:
-            numbers = {**meter.means(), "learning_rate": rate}
-            if not math.isfinite(numbers["total"]):
-                raise DivergedError(f"the loss is {numbers['total']} at step {step + 1}; lower the learning rate")
-            log.add("train", step + 1, epoch, numbers)
-            left = duration((steps - step - 1) * optimisation.batch_size / whole.means()["samples_per_second"])
-            report(
-                f"epoch {epoch + 1}/{optimisation.epochs} step {step + 1}/{steps}: total {numbers['total']:.4f} "
-                f"flipped {numbers['flipped']:.4f}, {numbers['samples_per_second']:.0f} vehicles/s, {left} left"
-            )
-            meter = Meter()
+        progress.add({"total": loss, "flipped": flipped}, rate)
 
 
 def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator) -> Looks:
@@ -227,10 +213,19 @@ def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator)
     order = (uniform(k, most) + behind).argsort(dim=1)  # those that are there first, in any order
     points = points.gather(1, order[..., None].expand(-1, -1, 3))
     points = points * (1.0 + config.stretch * (2.0 * uniform(k, 1, 3) - 1.0))
+    points = _bent(points, vehicle[:, 3:4], config.bend * torch.randn(k, 3, 1, generator=random))
     points = points + config.jitter * torch.randn(points.shape, generator=random)
     around = around * (uniform(k, 1, 1) >= config.alone)
     vehicle = torch.cat([vehicle[:, :8], vehicle[:, 8:] * (uniform(k, 1) >= config.unsure)], dim=1)
     return Looks(points, left, vehicle, around)
+
+
+def _bent(points: Tensor, length: Tensor, by: Tensor) -> Tensor:
+    """Points (K, P, 3) on vehicles of these lengths (K, 1), as on other bodies; `by` (K, 3, 1): two waves, one tilt."""
+    x, y, z = points.unbind(dim=2)
+    along = x / length  # from -0.5 to 0.5
+    wave = by[:, 0] * torch.cos(math.pi * along) + by[:, 1] * torch.sin(2.0 * math.pi * along)
+    return torch.stack([x + wave * length, y, z * (1.0 + 2.0 * by[:, 2] * along)], dim=2)
 
 
 @torch.inference_mode()

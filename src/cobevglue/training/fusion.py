@@ -24,10 +24,11 @@ from cobevglue.settings import Settings
 from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import settings_from
-from cobevglue.training.detector import DivergedError, TrainingResult
+from cobevglue.training.detector import TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
-from cobevglue.training.run_log import Meter, RunLog, duration, print_progress
+from cobevglue.training.progress import EpochProgress
+from cobevglue.training.run_log import RunLog, print_progress
 
 __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
 
@@ -161,7 +162,7 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
     loss, anchors = DetectionLoss(detector.config), AnchorGrid(detector.config)
     learner = Learner(model, optimisation, state)
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
-    batches = optimisation.samples_per_epoch // optimisation.batch_size
+    batches = optimisation.steps_per_epoch()
     noise = config.noise if config.noise is not None else model.training_noise
     metrics: dict[str, float] = {}
     folder.mkdir(parents=True, exist_ok=True)
@@ -203,32 +204,17 @@ def _train_epoch(
         prefetch_factor=2 if config.workers else None,
         generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
     )
+    progress = EpochProgress(optimisation, epoch, log, report, every=config.report_every, name=config.method)
     model = learner.model.train()
-    meter, whole = Meter(), Meter()
-    steps = optimisation.epochs * len(loader)
-    step = epoch * len(loader)
     anchors = len(model.anchors)
     asked = time.monotonic()
-    for items in loader:
+    for step, items in zip(progress.steps, loader, strict=True):
         waited = time.monotonic() - asked
         targets = collate_targets([item.targets for item in items], anchors)
         with autocast(optimisation, torch.device("cpu")):
             terms = model.loss([item.sample for item in items], targets, loss)
-        rate, norm = learner.learn(terms["total"], step, steps)
-        step += 1
-        for m in (meter, whole):
-            m.add({**{n: t.detach() for n, t in terms.items()}, "gradient": norm}, len(items), waited)
-        if meter.seconds >= config.report_every or step == (epoch + 1) * len(loader):
-            numbers = {**meter.means(), "learning_rate": rate}
-            if not math.isfinite(numbers["total"]):
-                raise DivergedError(f"the loss is {numbers['total']} at step {step}; lower optimisation.learning_rate")
-            log.add("train", step, epoch, numbers)
-            left = duration((steps - step) * optimisation.batch_size / whole.means()["samples_per_second"])
-            listed = " ".join(f"{name} {value:.3f}" for name, value in numbers.items())
-            report(
-                f"{config.method}: epoch {epoch + 1}/{optimisation.epochs} step {step}/{steps}: {listed}; {left} left"
-            )
-            meter = Meter()
+        rate, norm = learner.learn(terms["total"], step, progress.all_steps)
+        progress.add({**terms, "gradient": norm}, rate, waited)
         asked = time.monotonic()
 
 

@@ -52,6 +52,20 @@ class OptimisationConfig(Settings):
     mean_decay: _Share = 0.999
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
+    def steps_per_epoch(self, processes: int = 1) -> int:
+        """Full batches in an epoch, of each of so many processes.
+
+        Raises:
+            ValueError: not even one.
+        """
+        steps = self.samples_per_epoch // (self.batch_size * processes)
+        if not steps:
+            raise ValueError(
+                f"optimisation.samples_per_epoch: {self.samples_per_epoch} samples are no full batch of "
+                f"{self.batch_size}" + (f" for each of {processes} processes" if processes > 1 else "")
+            )
+        return steps
+
 
 def autocast(config: OptimisationConfig, device: torch.device) -> torch.autocast:
     """The context for the forward pass in the precision that `config` asks for."""

@@ -7,14 +7,11 @@ import math
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
-import torch
-
-__all__ = ["Meter", "RunLog", "duration", "print_progress"]
+__all__ = ["RunLog", "print_progress"]
 
 
 def print_progress(text: str) -> None:
@@ -75,37 +72,3 @@ def _complete_lines(path: Path) -> list[str]:
     """Those of an earlier try; one that was cut off while writing is left out."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
     return [line for line in lines if line.endswith("}\n")]
-
-
-@dataclass
-class Meter:
-    """Means over steps. Sums stay on the device: asking a GPU for a number makes it wait."""
-
-    started: float = field(default_factory=time.monotonic)
-    sums: dict[str, torch.Tensor] = field(default_factory=dict)
-    steps: int = 0
-    samples: int = 0
-    waited: float = 0.0
-
-    def add(self, values: Mapping[str, torch.Tensor], samples: int, waited: float) -> None:
-        """The values of a step, its samples, and the time it waited for them [s]."""
-        for name, value in values.items():
-            self.sums[name] = self.sums[name] + value if name in self.sums else value
-        self.steps, self.samples, self.waited = self.steps + 1, self.samples + samples, self.waited + waited
-
-    @property
-    def seconds(self) -> float:
-        """Since the first."""
-        return time.monotonic() - self.started
-
-    def means(self) -> dict[str, float]:
-        """Of the values, with "samples_per_second" and the share of time spent "waiting"."""
-        seconds = max(self.seconds, 1e-9)
-        terms = {name: float(value) / self.steps for name, value in self.sums.items()}
-        return {**terms, "samples_per_second": self.samples / seconds, "waiting": self.waited / seconds}
-
-
-def duration(seconds: float) -> str:
-    """In words: "5 min", "1 h 20 min"."""
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
