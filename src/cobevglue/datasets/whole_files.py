@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,10 +16,10 @@ __all__ = ["whole_file", "write_json"]
 def whole_file(path: Path) -> Iterator[Path]:
     """A path to write to, which takes the place of `path` when all went well; folders are made.
 
-    It is beside `path`, with a name that no reader of a data set looks at.
+    It is beside `path`, with a name that no reader of a data set looks at and that no other process writes to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         partial.replace(path)

@@ -43,9 +43,10 @@ def write_shards(
     """
     folder.mkdir(parents=True, exist_ok=True)
     started = folder / _SETTINGS
-    if started.is_file() and json.loads(started.read_text(encoding="utf-8")) != settings:
+    if not started.is_file():
+        write_json(started, settings)
+    elif json.loads(started.read_text(encoding="utf-8")) != settings:
         raise ValueError(f"{folder}: was made with other settings or another detector; choose another folder")
-    write_json(started, settings)
     if (folder / _INDEX).is_file():
         return
     files: list[str] = []
