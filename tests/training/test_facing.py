@@ -139,11 +139,11 @@ def test_augmentation_thins_shakes_and_hides_and_keeps_what_it_should() -> None:
     looks = Looks(points, number, vehicle, around)
     random = torch.Generator().manual_seed(0)
 
-    nothing = FacingAugmentation(thinning=0.0, jitter=0.0, stretch=0.0, bend=0.0, alone=0.0, unsure=0.0)
+    nothing = FacingAugmentation(thinning=0.0, jitter=0.0, stretch=0.0, alone=0.0, unsure=0.0)
     for before, after in zip(looks, augmented(looks, nothing, random), strict=True):
         assert torch.equal(before, after)
 
-    some = FacingAugmentation(thinning=0.5, jitter=0.01, stretch=0.1, bend=0.0, alone=0.25, unsure=0.25)
+    some = FacingAugmentation(thinning=0.5, jitter=0.01, stretch=0.1, alone=0.25, unsure=0.25)
     other = augmented(looks, some, random)
     share = other.number / number
     assert share.min() >= 0.5
@@ -158,18 +158,3 @@ def test_augmentation_thins_shakes_and_hides_and_keeps_what_it_should() -> None:
     assert torch.equal(other.around[~hidden], around[~hidden])
     assert 0.15 < (other.vehicle[:, 8] == 0).float().mean() < 0.35
     assert torch.equal(other.vehicle[:, :8], vehicle[:, :8])
-
-
-def test_a_bent_vehicle_keeps_its_ends_and_its_width() -> None:
-    along = torch.linspace(-2.0, 2.0, 64)
-    points = torch.stack([along, torch.full((64,), 0.9), torch.full((64,), 0.5)], dim=1).expand(300, 64, 3).contiguous()
-    vehicle = torch.full((300, 9), 4.0)
-    looks = Looks(points, torch.full((300,), 64), vehicle, torch.zeros(300, 8, 6))
-    bend = FacingAugmentation(thinning=0.0, jitter=0.0, stretch=0.0, bend=0.02, alone=0.0, unsure=0.0)
-    x, y, z = augmented(looks, bend, torch.Generator().manual_seed(0)).points.sort(dim=1).values.unbind(dim=2)
-    assert torch.allclose(x[:, [0, -1]], torch.tensor([-2.0, 2.0]), atol=1e-5)
-    assert torch.equal(y, points[..., 1])
-    shift = (x - along).abs().amax(dim=1)
-    assert 0.05 < shift.median() < 0.2  # some 2 % of 4 m
-    assert (z.amax(dim=1) > 0.5).all()  # raised at one end ...
-    assert (z.amin(dim=1) < 0.5).all()  # ... lowered at the other

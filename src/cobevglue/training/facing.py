@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -50,8 +49,6 @@ class FacingAugmentation(Settings):
         thinning: up to this share of the points on a vehicle is dropped.
         jitter: standard deviation by which each point is moved along each axis [m].
         stretch: a vehicle's points are stretched along each axis by a factor between 1 - this and 1 + this.
-        bend: its parts are shifted along it by waves of this deviation, in shares of its length, and raised in front
-            or behind by this deviation, in shares of its height.
         alone: share of vehicles around which no other is seen.
         unsure: share of vehicles of which the head's opinion is not known.
     """
@@ -59,7 +56,6 @@ class FacingAugmentation(Settings):
     thinning: _Share = 0.7
     jitter: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
     stretch: _Share = 0.06
-    bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
     alone: _Share = 0.2
     unsure: _Share = 0.2
 
@@ -213,19 +209,10 @@ def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator)
     order = (uniform(k, most) + behind).argsort(dim=1)  # those that are there first, in any order
     points = points.gather(1, order[..., None].expand(-1, -1, 3))
     points = points * (1.0 + config.stretch * (2.0 * uniform(k, 1, 3) - 1.0))
-    points = _bent(points, vehicle[:, 3:4], config.bend * torch.randn(k, 3, 1, generator=random))
     points = points + config.jitter * torch.randn(points.shape, generator=random)
     around = around * (uniform(k, 1, 1) >= config.alone)
     vehicle = torch.cat([vehicle[:, :8], vehicle[:, 8:] * (uniform(k, 1) >= config.unsure)], dim=1)
     return Looks(points, left, vehicle, around)
-
-
-def _bent(points: Tensor, length: Tensor, by: Tensor) -> Tensor:
-    """Points (K, P, 3) on vehicles of these lengths (K, 1), as on other bodies; `by` (K, 3, 1): two waves, one tilt."""
-    x, y, z = points.unbind(dim=2)
-    along = x / length  # from -0.5 to 0.5
-    wave = by[:, 0] * torch.cos(math.pi * along) + by[:, 1] * torch.sin(2.0 * math.pi * along)
-    return torch.stack([x + wave * length, y, z * (1.0 + 2.0 * by[:, 2] * along)], dim=2)
 
 
 @torch.inference_mode()
