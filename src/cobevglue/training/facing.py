@@ -78,12 +78,12 @@ class TrainFacingConfig(Settings):
 
     detector: str = "compact"
     data: DataConfig = DataConfig(min_points=2)
-    episodes: _Count = 800
-    validation_episodes: _Count = 12
+    episodes: _Count = 1600
+    validation_episodes: _Count = 24
     examples: Path = Path("runs/facing-examples")
     augmentation: FacingAugmentation = FacingAugmentation()
     optimisation: OptimisationConfig = OptimisationConfig(
-        epochs=10, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
+        epochs=15, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
     )
     seed: Annotated[int, Field(ge=0)] = 0
     threads: _Count = 2
