@@ -417,6 +417,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
         ),
     ),
 }
+"""Side and plan views by kind of vehicle; where there are several, each is as likely."""
 
 _SPREAD = 0.04
 """Standard deviation, in shares, by which heights and widths differ within a kind."""
@@ -425,7 +426,12 @@ _SHIFTS = (0.03, 0.02, 0.012)
 
 
 def varied(body: Body, rng: np.random.Generator) -> Body:
-    """The same kind of body, a little different: pillars further ahead or behind, boot and bonnet higher or lower."""
+    """The same kind of body, a little different: pillars further ahead or behind, boot and bonnet higher or lower.
+
+    Args:
+        body: what all of its kind are like.
+        rng: for what differs; the same draws give the same body.
+    """
     stations = np.array(body.stations)
     spread = rng.normal(scale=_SPREAD, size=5)
     along = stations[:, 0]
