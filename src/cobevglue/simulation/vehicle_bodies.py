@@ -6,7 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cobevglue.typing import BoolArray, FloatArray
+
 __all__ = ["BODIES", "Body", "varied"]
+
+_WINDOW = 0.12
+"""From this height of the roof above the shoulder on there are windows, in shares of the height."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +33,18 @@ class Body:
     axles: tuple[float, ...] = (0.19, 0.81)
     wheel: float = 0.215
     mirror: float = 0.10
+
+    @property
+    def profile(self) -> FloatArray:
+        """(4, S) the stations: along, shoulder height, roof height, half width."""
+        return np.array(self.stations).T
+
+    @property
+    def windows(self) -> BoolArray:
+        """(S,) at which stations the roof is so far above the shoulder that there are windows."""
+        _, shoulder, roof, _ = self.profile
+        open_: BoolArray = roof - shoulder > _WINDOW
+        return open_
 
 
 BODIES: dict[str, tuple[Body, ...]] = {
@@ -432,17 +449,14 @@ def varied(body: Body, rng: np.random.Generator) -> Body:
         body: what all of its kind are like.
         rng: for what differs; the same draws give the same body.
     """
-    stations = np.array(body.stations)
-    spread = rng.normal(scale=_SPREAD, size=5)
-    along = stations[:, 0]
+    along, shoulder, roof, half_width = body.profile
+    spread = rng.normal(scale=_SPREAD, size=5)  # one more than is used: without it all simulated cars would be others
     shift = np.clip(rng.normal(size=len(_SHIFTS)), -1.7, 1.7) * _SHIFTS  # so bounded, their order stays
     moved = along + np.sin(np.pi * np.outer(along, 1 + np.arange(len(shift)))) @ shift
     raised = 1.0 + spread[0] + spread[1] * (2.0 * along - 1.0)
-    shoulder = stations[:, 1] * raised
-    cabin = (stations[:, 2] - stations[:, 1]) > 0.1
-    roof = np.where(cabin, stations[:, 2], stations[:, 2] * raised)
-    corner = 1.0 - (1.0 - stations[:, 3]) * np.exp(5.0 * spread[2])
-    columns = moved, np.minimum(shoulder, 0.98), np.minimum(roof, 1.0), np.clip(corner, 0.25, 1.0)
+    roof = np.where(body.windows, roof, roof * raised)
+    corner = 1.0 - (1.0 - half_width) * np.exp(5.0 * spread[2])
+    columns = moved, np.minimum(shoulder * raised, 0.98), np.minimum(roof, 1.0), np.clip(corner, 0.25, 1.0)
     axles = tuple(float(np.interp(axle, along, moved)) for axle in body.axles)
     return Body(
         tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in np.stack(columns, axis=1)),

@@ -23,8 +23,6 @@ _PAINT, _TYRE, _INSIDE = (0.2, 0.9), 0.1, 0.3
 _CLEAR_GLASS_SHARE = 0.3
 """Share of vehicles with windows that let rays through; the others' are opaque, as all of CARLA's are."""
 _CLEAR_GLASS = (0.4, 0.95)
-_WINDOW = 0.12
-"""Where the roof is higher than this above the shoulder, in shares of the height, there are windows."""
 
 
 def vehicle_mesh(kind: str, size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
@@ -58,10 +56,10 @@ def _car(body: Body, size: FloatArray, rng: np.random.Generator) -> Mesh:
     paint = float(rng.uniform(*_PAINT))
     glass = float(rng.uniform(*_CLEAR_GLASS)) if rng.random() < _CLEAR_GLASS_SHARE else 0.0
     parts = [_shell(body, length, half_width, height, paint, glass)]
-    along, shoulder, roof, _ = np.array(body.stations).T
-    cabin = along[roof - shoulder > _WINDOW]
+    along, shoulder, _, _ = body.profile
+    rear_window, windscreen = np.flatnonzero(body.windows)[[0, -1]]
     if glass > 0.0:
-        parts += _inside((float(cabin[0]), float(cabin[-1])), length, half_width, height)
+        parts += _inside((along[rear_window], along[windscreen]), length, half_width, height)
     radius = body.wheel * height
     tread = min(0.3, 0.28 * radius + 0.12)
     for axle in body.axles:
@@ -69,8 +67,8 @@ def _car(body: Body, size: FloatArray, rng: np.random.Generator) -> Mesh:
         for side in (-1, 1):
             middle = (x, side * (half_width - tread / 2 + 0.015), radius)
             parts.append(cylinder(middle, radius, tread, _TYRE, axis="y"))
-    mirror_x = min((cabin[-1] - 0.5) * length + rng.uniform(0.05, 0.35), 0.5 * length - 0.15)
-    mirror_z = shoulder[along == cabin[-1]][0] * height + 0.08
+    mirror_x = min((along[windscreen] - 0.5) * length + rng.uniform(0.05, 0.35), 0.5 * length - 0.15)
+    mirror_z = shoulder[windscreen] * height + 0.08
     for side in (-1, 1):
         middle = (mirror_x, side * (half_width + body.mirror / 2), mirror_z)
         parts.append(box(middle, (rng.uniform(0.1, 0.25), body.mirror, rng.uniform(0.1, 0.2)), reflectivity=paint))
@@ -79,8 +77,7 @@ def _car(body: Body, size: FloatArray, rng: np.random.Generator) -> Mesh:
 
 def _shell(body: Body, length: float, half_width: float, height: float, paint: float, glass: float) -> Mesh:
     """The loft: at each station a cross section from the underbody over sill, flank, shoulder and roof edge."""
-    stations = np.array(body.stations)
-    along, shoulder, roof, plan = stations.T
+    along, shoulder, roof, plan = body.profile
     x = (along - 0.5) * length
     w = plan * half_width
     low = np.full_like(along, body.clearance * height)
@@ -106,7 +103,7 @@ def _shell(body: Body, length: float, half_width: float, height: float, paint: f
     ring = np.concatenate([ring, ring[:, :1]], axis=1)  # closed by the underbody
     faces = np.stack([ring[:-1, :-1], ring[1:, :-1], ring[1:, 1:], ring[:-1, 1:]], axis=2)
     is_glass = np.zeros(faces.shape[:2], dtype=bool)
-    opened = roof - shoulder > _WINDOW
+    opened = body.windows
     points = section.shape[1]
     side_windows = opened[:-1] & opened[1:]
     is_glass[:, 3] = is_glass[:, 2 * points - 6] = side_windows

@@ -73,8 +73,9 @@ class EpochProgress:
             DivergedError: the loss is not finite any more; seen when there is something to report.
         """
         self._step += 1
+        detached = {name: value.detach() for name, value in values.items()}
         for meter in (self._whole, self._recent):
-            meter.add({name: value.detach() for name, value in values.items()}, self._batch, waited)
+            meter.add(detached, self._batch, waited)
         if self._step == self.steps.stop:
             self._say("epoch", self._whole, rate)
         elif self._recent.seconds >= self._every:
