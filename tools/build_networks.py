@@ -1,4 +1,4 @@
-"""Rebuild the road networks stored in `cobevglue.simulation`: five kinds, each in several seeded variants.
+"""Rebuild the road networks stored in `cobevglue.simulation`: six kinds, each in several seeded variants.
 
     pip install eclipse-sumo && python tools/build_networks.py
 
@@ -10,6 +10,7 @@ files are the same bytes every time for one version of netconvert.
 from __future__ import annotations
 
 import gzip
+import itertools
 import math
 import re
 import subprocess
@@ -221,13 +222,66 @@ def residential(rng: np.random.Generator, variant: int) -> Plan:
     return plan
 
 
+def town(rng: np.random.Generator, variant: int) -> Plan:
+    """Streets of one to three lanes each way that cross each other; the wider ones at signals."""
+    plan = Plan()
+    turned, width = rng.uniform(0, 2 * math.pi), rng.uniform(3.1, 3.6)
+    axes = _unit(turned), _unit(turned + math.pi / 2)
+    crossed = 2 + variant % 2, 2 + variant // 2 % 2  # how many streets there are along each axis
+    places = [_places(rng, number) for number in crossed]
+    lanes = [rng.integers(1, 4, size=number) for number in crossed]
+    lanes[variant % 2][0] = 2 + variant % 2
+    nodes: dict[tuple[int, int], FloatArray] = {}
+    for i, x in enumerate(places[0]):
+        for j, y in enumerate(places[1]):
+            wide = max(lanes[0][i], lanes[1][j]) > 1
+            nodes[i, j] = (x + rng.uniform(-5, 5)) * axes[0] + (y + rng.uniform(-5, 5)) * axes[1]
+            plan.node(f"c{i}{j}", nodes[i, j], type="traffic_light" if wide or rng.random() < 0.3 else "priority")
+    for axis in (0, 1):
+        for street, place in enumerate(places[axis]):
+            stops = []
+            for sign in (-1, 1):
+                end = place * axes[axis] + sign * _EXTENT * axes[1 - axis]
+                plan.node(f"n{axis}{street}{sign}", end)
+                stops.append((f"n{axis}{street}{sign}", end))
+            between = [(street, k) if axis == 0 else (k, street) for k in range(crossed[1 - axis])]
+            stops[1:1] = [(f"c{i}{j}", nodes[i, j]) for i, j in between]
+            for pair in itertools.pairwise(stops):
+                for start, end in (pair, pair[::-1]):
+                    _street(plan, start, end, rng, int(lanes[axis][street]), width)
+    return plan
+
+
 _BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
     "junction": junction,
     "t_junction": t_junction,
     "roundabout": roundabout,
     "highway": highway,
     "residential": residential,
+    "town": town,
 }
+
+
+def _places(rng: np.random.Generator, number: int) -> FloatArray:
+    """Where parallel streets are, beside a town's middle [m]."""
+    gaps = rng.uniform(60, 110, number - 1)
+    return np.r_[0.0, np.cumsum(gaps)] - gaps.sum() / 2 + rng.uniform(-20, 20)
+
+
+def _street(
+    plan: Plan,
+    start: tuple[str, FloatArray],
+    end: tuple[str, FloatArray],
+    rng: np.random.Generator,
+    lanes: int,
+    width: float,
+) -> None:
+    """A straight road one way between two nodes; if it leads to a crossing, perhaps with a lane for turning left."""
+    (a, from_), (b, to) = start, end
+    pocket = b.startswith("c") and np.hypot(*(to - from_)) > 55 and rng.random() < 0.4
+    split = float(rng.uniform(22, 35)) if pocket else 0.0
+    shape = np.array([from_, to])
+    plan.edge(f"{a}_{b}", a, b, shape, lanes + pocket, _TOWN, width, split, pocket, priority=3 + 2 * lanes)
 
 
 def _arm(

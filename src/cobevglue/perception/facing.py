@@ -27,7 +27,7 @@ _MARGIN = 0.3
 """By how much a box is enlarged on every side, for the points of what it missed [m]."""
 _BELOW, _ABOVE = 0.1, 0.4
 """The same downwards, where the ground is near, and upwards [m]."""
-_VEHICLES = 8
+_VEHICLES = 16
 """The nearest ones are looked at around each."""
 _CHANNELS = 64
 _NEAR, _FAR = 20.0, 50.0  # metres that count as 1

@@ -36,10 +36,11 @@ __all__ = [
     "network_file",
 ]
 
-NETWORK_KINDS = ("junction", "t_junction", "roundabout", "highway", "residential")
-"""What kinds of network there are: signalised junction, T-junction, roundabout, highway with ramps, housing area."""
+NETWORK_KINDS = ("junction", "t_junction", "roundabout", "highway", "residential", "town")
+"""What kinds of network there are: signalised junction, T-junction, roundabout, highway with ramps, housing area, and
+streets that cross each other."""
 
-_VARIANTS = {"train": 5, "validation": 1, "test": 2}
+_VARIANTS = {"train": 10, "validation": 1, "test": 2}
 
 NETWORKS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
     {

@@ -110,18 +110,19 @@ class _Builder:
         self.ground = Ground.random(rng)
         built_up, green, parking = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0), rng.uniform(0.0, 0.7) ** 1.5
         if self.roads.kind == "highway":
-            built_up, parking = 0.3 * built_up, 0.0
+            built_up *= 0.3
         if self.roads.kind == "residential":
             parking = max(parking, 0.25)
+        nobody_parks = self.roads.kind == "highway" or (self.roads.kind == "town" and rng.random() < 0.5)
         self._lay_ground()
         pavement = float(rng.uniform(1.2, 4.5))
         if self.roads.kind != "highway" or rng.random() < 0.3:
             self._lay_kerbs(float(rng.uniform(0.06, 0.22)), pavement)
         else:
             self._guard_rails()
-        self._park_along(parking)
+        self._park_along(0.0 if nobody_parks else parking)
         self._buildings(built_up, pavement)
-        self._car_parks(int(rng.integers(0, 4)) if self.roads.kind != "highway" else 0)
+        self._car_parks(0 if nobody_parks else int(rng.integers(0, 4)))
         self._walls(built_up)
         self._street_furniture(pavement, built_up)
         self._trees(green, pavement)
