@@ -65,6 +65,13 @@ def test_junctions_have_signals(name: str) -> None:
     assert "traffic_light" in {junction.kind for junction in RoadNetwork.load(name).junctions}
 
 
+@pytest.mark.parametrize("name", [name for name in ALL if name.startswith("town")])
+def test_in_towns_streets_cross_and_some_at_signals(name: str) -> None:
+    crossings = [junction.kind for junction in RoadNetwork.load(name).junctions]
+    assert len(crossings) >= 4
+    assert "traffic_light" in crossings
+
+
 def test_an_unknown_network_is_an_error_that_names_the_nearest() -> None:
     with pytest.raises(ValueError, match=r"'roundabout_train0'; did you mean 'roundabout_train_0'\?"):
         RoadNetwork.load("roundabout_train0")

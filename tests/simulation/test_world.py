@@ -74,6 +74,15 @@ def test_parked_vehicles_are_beside_the_road_and_not_in_each_other(kind: str) ->
         assert overlap.max() < 0.05
 
 
+def test_in_half_of_the_towns_nobody_parks() -> None:
+    empty = sum(not len(World("town_test_0", seed).parked) for seed in range(12))
+    assert 2 <= empty <= 10
+
+
+def test_on_highways_nobody_parks() -> None:
+    assert not any(len(World("highway_test_0", seed).parked) for seed in range(4))
+
+
 @pytest.mark.parametrize("kind", NETWORK_KINDS)
 def test_nothing_solid_stands_on_the_road(kind: str) -> None:
     """No triangle corner between bumper and roof height is more than half a metre inside the road."""
