@@ -230,7 +230,7 @@ def town(rng: np.random.Generator, variant: int) -> Plan:
     crossed = 2 + variant % 2, 2 + variant // 2 % 2  # how many streets there are along each axis
     places = [_places(rng, number) for number in crossed]
     lanes = [rng.integers(1, 4, size=number) for number in crossed]
-    lanes[variant % 2][0] = 2 + variant % 2
+    lanes[variant % 2][0] = 2 + variant % 2  # one street at least is wide
     nodes: dict[tuple[int, int], FloatArray] = {}
     for i, x in enumerate(places[0]):
         for j, y in enumerate(places[1]):

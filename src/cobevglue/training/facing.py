@@ -78,7 +78,7 @@ class TrainFacingConfig(Settings):
 
     detector: str = "compact"
     data: DataConfig = DataConfig(min_points=2)
-    episodes: _Count = 1600
+    episodes: _Count = 1800
     validation_episodes: _Count = 24
     examples: Path = Path("runs/facing-examples")
     augmentation: FacingAugmentation = FacingAugmentation()
