@@ -231,24 +231,23 @@ def town(rng: np.random.Generator, variant: int) -> Plan:
     places = [_places(rng, number) for number in crossed]
     lanes = [rng.integers(1, 4, size=number) for number in crossed]
     lanes[variant % 2][0] = 2 + variant % 2  # one street at least is wide
-    nodes: dict[tuple[int, int], FloatArray] = {}
+    at: dict[str, FloatArray] = {}
     for i, x in enumerate(places[0]):
         for j, y in enumerate(places[1]):
             wide = max(lanes[0][i], lanes[1][j]) > 1
-            nodes[i, j] = (x + rng.uniform(-5, 5)) * axes[0] + (y + rng.uniform(-5, 5)) * axes[1]
-            plan.node(f"c{i}{j}", nodes[i, j], type="traffic_light" if wide or rng.random() < 0.3 else "priority")
+            at[f"c{i}{j}"] = (x + rng.uniform(-5, 5)) * axes[0] + (y + rng.uniform(-5, 5)) * axes[1]
+            kind = "traffic_light" if wide or rng.random() < 0.3 else "priority"
+            plan.node(f"c{i}{j}", at[f"c{i}{j}"], type=kind)
     for axis in (0, 1):
         for street, place in enumerate(places[axis]):
-            stops = []
-            for sign in (-1, 1):
-                end = place * axes[axis] + sign * _EXTENT * axes[1 - axis]
-                plan.node(f"n{axis}{street}{sign}", end)
-                stops.append((f"n{axis}{street}{sign}", end))
-            between = [(street, k) if axis == 0 else (k, street) for k in range(crossed[1 - axis])]
-            stops[1:1] = [(f"c{i}{j}", nodes[i, j]) for i, j in between]
-            for pair in itertools.pairwise(stops):
-                for start, end in (pair, pair[::-1]):
-                    _street(plan, start, end, rng, int(lanes[axis][street]), width)
+            ends = [f"n{axis}{street}{sign}" for sign in (-1, 1)]
+            for name, sign in zip(ends, (-1, 1), strict=True):
+                at[name] = place * axes[axis] + sign * _EXTENT * axes[1 - axis]
+                plan.node(name, at[name])
+            crossings = [f"c{street}{k}" if axis == 0 else f"c{k}{street}" for k in range(crossed[1 - axis])]
+            for a, b in itertools.pairwise([ends[0], *crossings, ends[1]]):
+                for start, end in ((a, b), (b, a)):
+                    _street(plan, start, end, at, rng, int(lanes[axis][street]), width)
     return plan
 
 
@@ -263,25 +262,19 @@ _BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
 
 
 def _places(rng: np.random.Generator, number: int) -> FloatArray:
-    """Where parallel streets are, beside a town's middle [m]."""
+    """How far parallel streets are from a town's middle [m], in order."""
     gaps = rng.uniform(60, 110, number - 1)
     return np.r_[0.0, np.cumsum(gaps)] - gaps.sum() / 2 + rng.uniform(-20, 20)
 
 
 def _street(
-    plan: Plan,
-    start: tuple[str, FloatArray],
-    end: tuple[str, FloatArray],
-    rng: np.random.Generator,
-    lanes: int,
-    width: float,
+    plan: Plan, start: str, end: str, at: dict[str, FloatArray], rng: np.random.Generator, lanes: int, width: float
 ) -> None:
     """A straight road one way between two nodes; if it leads to a crossing, perhaps with a lane for turning left."""
-    (a, from_), (b, to) = start, end
-    pocket = b.startswith("c") and np.hypot(*(to - from_)) > 55 and rng.random() < 0.4
+    shape = np.array([at[start], at[end]])
+    pocket = end.startswith("c") and np.hypot(*(shape[1] - shape[0])) > 55 and rng.random() < 0.4
     split = float(rng.uniform(22, 35)) if pocket else 0.0
-    shape = np.array([from_, to])
-    plan.edge(f"{a}_{b}", a, b, shape, lanes + pocket, _TOWN, width, split, pocket, priority=3 + 2 * lanes)
+    plan.edge(f"{start}_{end}", start, end, shape, lanes + pocket, _TOWN, width, split, pocket, priority=3 + 2 * lanes)
 
 
 def _arm(

@@ -75,12 +75,14 @@ def test_parked_vehicles_are_beside_the_road_and_not_in_each_other(kind: str) ->
 
 
 def test_in_half_of_the_towns_nobody_parks() -> None:
-    empty = sum(not len(World("town_test_0", seed).parked) for seed in range(12))
+    roads = RoadNetwork.load("town_test_0")
+    empty = sum(not build_scenery(roads, np.random.default_rng(seed)).parked for seed in range(12))
     assert 2 <= empty <= 10
 
 
 def test_on_highways_nobody_parks() -> None:
-    assert not any(len(World("highway_test_0", seed).parked) for seed in range(4))
+    roads = RoadNetwork.load("highway_test_0")
+    assert not any(build_scenery(roads, np.random.default_rng(seed)).parked for seed in range(4))
 
 
 @pytest.mark.parametrize("kind", NETWORK_KINDS)
