@@ -145,7 +145,6 @@ _VOTING = DetectionConfig(variance_voting=True)
 CONFIGS: dict[str, PointPillarsConfig] = {
     "opv2v": PointPillarsConfig(
         x_range=(-140.8, 140.8),
-        use_intensity=True,
         pillar_channels=64,
         block_layers=(3, 5, 8),
         block_channels=(64, 128, 256),
@@ -159,5 +158,6 @@ CONFIGS: dict[str, PointPillarsConfig] = {
     ),
     "compact": PointPillarsConfig(detection=_VOTING),
 }
-"""`opv2v`: the size that the papers on OPV2V use (with residual blocks, as CoAlign and CoBEVGlue do), for a GPU.
+"""`opv2v`: the size that the papers on OPV2V use (with residual blocks, as CoAlign and CoBEVGlue do), for a GPU. They
+give it intensity, which in OPV2V's clouds is a function of the range, and in others something else; here it has none.
 `compact`: about a million weights, for a CPU; roadside LiDARs, vans, buses and lorries too."""

@@ -22,6 +22,7 @@ from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import TrainingResult
 from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
+from cobevglue.training.processes import chosen_device
 from cobevglue.training.progress import EpochProgress
 from cobevglue.training.run_log import RunLog, print_progress
 from cobevglue.training.sources import make_source
@@ -72,6 +73,7 @@ class TrainFacingConfig(Settings):
         augmentation: how what is seen of a vehicle is changed.
         optimisation: how weights are found; a sample is a vehicle.
         seed: of the episodes, the first weights and the order of samples.
+        device: looks at clouds and learns; "auto" takes CUDA where there is one.
         threads: of torch; as many processes look at clouds.
         report_every: time between lines of progress [s].
     """
@@ -86,11 +88,12 @@ class TrainFacingConfig(Settings):
         epochs=15, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
     )
     seed: Annotated[int, Field(ge=0)] = 0
+    device: str = "auto"
     threads: _Count = 2
     report_every: Annotated[float, Field(gt=0.0)] = 20.0
 
 
-FREE_TO_CHANGE = {"examples", "threads", "report_every"}
+FREE_TO_CHANGE = {"examples", "device", "threads", "report_every"}
 """A run may be resumed with other values of these."""
 
 
@@ -115,21 +118,23 @@ def train_facing(
         DivergedError: the loss is not finite any more.
     """
     with torch_threads(config.threads):
-        return _train(config, folder, resume, report)
+        return _train(config, folder, resume, chosen_device(config.device), report)
 
 
-def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callable[[str], None]) -> TrainingResult:
+def _train(
+    config: TrainFacingConfig, folder: Path, resume: bool, device: torch.device, report: Callable[[str], None]
+) -> TrainingResult:
     optimisation = config.optimisation
     detector = PointPillars.named(config.detector)
     # How the detector came about stays known; of an earlier second look nothing is left.
     earlier = detector.metadata.get("stages", [detector.metadata])
     detector.metadata = {"stages": [stage for stage in earlier if stage.get("stage") != _STAGE]}
-    state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume)
-    training, validation = (_examples(config, detector, measured, report) for measured in (False, True))
+    state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume, device=device)
+    training, validation = (_examples(config, detector, measured, device, report) for measured in (False, True))
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        net = FacingNet()
+        net = FacingNet().to(device)
     learner = Learner(net, optimisation, state)
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     metrics: dict[str, float] = {}
@@ -152,9 +157,13 @@ def _train(config: TrainFacingConfig, folder: Path, resume: bool, report: Callab
 
 
 def _examples(
-    config: TrainFacingConfig, detector: PointPillars, measured: bool, report: Callable[[str], None]
+    config: TrainFacingConfig,
+    detector: PointPillars,
+    measured: bool,
+    device: torch.device,
+    report: Callable[[str], None],
 ) -> FacingExamples:
-    """What the detector finds in the training or the validation split."""
+    """What the detector finds in the training or the validation split, on `device`."""
     split = config.data.validation_split if measured else config.data.split
     described = {
         **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "workers"}),
@@ -163,7 +172,8 @@ def _examples(
         "episodes": config.validation_episodes if measured else config.episodes,
     }
     source = make_source(config.data, config.seed, validation=measured)
-    return write_facing_examples(config.examples / split, source, described, detector, config.threads, report)
+    folder = config.examples / split
+    return write_facing_examples(folder, source, described, detector, config.threads, device, report).to(device)
 
 
 def _train_epoch(
@@ -177,12 +187,14 @@ def _train_epoch(
     optimisation = config.optimisation
     progress = EpochProgress(optimisation, epoch, log, report, every=config.report_every)
     rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
-    random = torch.Generator().manual_seed(int(rng.integers(2**63)))
+    device = examples.right.device
+    random = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
     learner.model.train()
     for step in progress.steps:
-        batch = examples.take(torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size)))
+        rows = torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size))
+        batch = examples.take(rows.to(device))
         looks = augmented(batch.looks, config.augmentation, random)
-        with autocast(optimisation, torch.device("cpu")):
+        with autocast(optimisation, device):
             logits = learner.model(looks)
         loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
         rate, _ = learner.learn(loss, step, progress.all_steps)
@@ -196,20 +208,20 @@ def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator)
     Args:
         looks: points in float32.
         config: how much is changed.
-        random: torch's, on the CPU.
+        random: torch's, on the device of the looks.
     """
     points, number, vehicle, around = looks
     k, most = points.shape[:2]
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=random)
+        return torch.rand(shape, generator=random, device=points.device)
 
     left = (number * (1.0 - config.thinning * uniform(k))).ceil().long()
-    behind = torch.arange(most) >= number[:, None]
+    behind = torch.arange(most, device=points.device) >= number[:, None]
     order = (uniform(k, most) + behind).argsort(dim=1)  # those that are there first, in any order
     points = points.gather(1, order[..., None].expand(-1, -1, 3))
     points = points * (1.0 + config.stretch * (2.0 * uniform(k, 1, 3) - 1.0))
-    points = points + config.jitter * torch.randn(points.shape, generator=random)
+    points = points + config.jitter * torch.randn(points.shape, generator=random, device=points.device)
     around = around * (uniform(k, 1, 1) >= config.alone)
     vehicle = torch.cat([vehicle[:, :8], vehicle[:, 8:] * (uniform(k, 1) >= config.unsure)], dim=1)
     return Looks(points, left, vehicle, around)
@@ -219,7 +231,8 @@ def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator)
 def _measure(net: FacingNet, examples: FacingExamples) -> dict[str, float]:
     """The loss, and the share of vehicles that are the wrong way round, without a second look and with it."""
     right = examples.right
-    logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(torch.arange(len(right)), 1024)])
+    every = torch.arange(len(right), device=right.device)
+    logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(every, 1024)])
     return {
         "loss": float(F.binary_cross_entropy_with_logits(logits, right.float())),
         "flipped_before": float((~right).float().mean()),
@@ -227,7 +240,10 @@ def _measure(net: FacingNet, examples: FacingExamples) -> dict[str, float]:
     }
 
 
-FACING_PRESETS: dict[str, TrainFacingConfig] = {"compact": TrainFacingConfig()}
+FACING_PRESETS: dict[str, TrainFacingConfig] = {
+    "compact": TrainFacingConfig(),
+    "opv2v": TrainFacingConfig(detector="opv2v"),
+}
 """Shipped settings by the name of the detector."""
 
 

@@ -47,6 +47,10 @@ class FacingExamples:
     looks: Looks
     right: Tensor
 
+    def to(self, device: torch.device) -> FacingExamples:
+        """The same on another device."""
+        return FacingExamples(Looks(*(values.to(device) for values in self.looks)), self.right.to(device))
+
     def take(self, rows: Tensor) -> FacingExamples:
         """Those in these rows, in the precision of a network."""
         looks = Looks(*(values[rows] for values in self.looks))
@@ -75,6 +79,7 @@ def write_facing_examples(
     config: Mapping[str, Any],
     detector: PointPillars,
     processes: int,
+    device: torch.device,
     report: Callable[[str], None],
 ) -> FacingExamples:
     """Look at episodes, or at those that are missing; a finished folder of the same settings is taken as it is.
@@ -86,6 +91,7 @@ def write_facing_examples(
             `examples_in`.
         detector: in evaluation mode.
         processes: how many look at episodes side by side.
+        device: where the detector looks.
         report: takes lines of progress.
 
     Raises:
@@ -99,12 +105,15 @@ def write_facing_examples(
 
     first_look = nn.ModuleList([detector.pillars, detector.backbone, detector.neck, detector.head])
     settings = {"config": dict(config), "detector": fingerprint(first_look)}
-    write = partial(_write, folder, source, detector, config["min_points"])
+    write = partial(_write, folder, source, detector, device, config["min_points"])
     write_shards(folder, settings, episodes, write, processes, progress)
     return _read(folder)
 
 
-def _write(folder: Path, source: EpisodeSource, detector: PointPillars, min_points: int, episode: int) -> list[str]:
+def _write(
+    folder: Path, source: EpisodeSource, detector: PointPillars, device: torch.device, min_points: int, episode: int
+) -> list[str]:
+    detector.to(device)  # here: another process cannot be sent what lies on a GPU
     examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
     if not examples:
         return []

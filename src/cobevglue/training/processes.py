@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-__all__ = ["Processes", "process_group"]
+__all__ = ["Processes", "chosen_device", "process_group"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,25 @@ class Processes:
         return values[0]
 
 
+def chosen_device(device: str) -> torch.device:
+    """The device of this name; under `torchrun`, CUDA is each process's own.
+
+    Args:
+        device: "auto" (CUDA where there is one), or torch's name of a device.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    name = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    if name == "cuda" and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        name = f"cuda:{int(os.environ['LOCAL_RANK'])}"
+    try:
+        return torch.zeros(1, device=name).device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"device {device!r} cannot be used: {first_line}") from None
+
+
 @contextmanager
 def process_group(device: str) -> Iterator[Processes]:
     """Join the processes that `torchrun` started, if it did.
@@ -60,25 +79,18 @@ def process_group(device: str) -> Iterator[Processes]:
     Raises:
         ValueError: there is no such device.
     """
-    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    chosen = chosen_device(device)
     count = int(os.environ.get("WORLD_SIZE", "1"))
-    if count > 1 and chosen == "cuda":
-        chosen = f"cuda:{int(os.environ['LOCAL_RANK'])}"
-    try:
-        torch.zeros(1, device=chosen)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        first_line = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"device {device!r} cannot be used: {first_line}") from None
     if count == 1 or dist.is_initialized():
         rank = dist.get_rank() if dist.is_initialized() else 0
-        yield Processes(torch.device(chosen), rank, dist.get_world_size() if dist.is_initialized() else 1)
+        yield Processes(chosen, rank, dist.get_world_size() if dist.is_initialized() else 1)
         return
-    if chosen.startswith("cuda"):
+    if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     # Gloo (torch 2.13) otherwise connects all processes at once, and now and then hangs in that.
     os.environ.setdefault("TORCH_GLOO_LAZY_INIT", "1")
-    dist.init_process_group("nccl" if chosen.startswith("cuda") else "gloo")
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:
-        yield Processes(torch.device(chosen), dist.get_rank(), dist.get_world_size())
+        yield Processes(chosen, dist.get_rank(), dist.get_world_size())
     finally:
         dist.destroy_process_group()
