@@ -177,6 +177,7 @@ class _Run:
             batch_size=optimisation.batch_size,
             seed=config.seed,
             pool=config.data.pool,
+            uses=config.data.uses,
             rank=self.processes.rank,
             processes=self.processes.count,
         )

@@ -73,6 +73,7 @@ class TrainFacingConfig(Settings):
         augmentation: how what is seen of a vehicle is changed.
         optimisation: how weights are found; a sample is a vehicle.
         seed: of the episodes, the first weights and the order of samples.
+        init_from: a detector, named like `detector`, whose second look is where to start.
         device: looks at clouds and learns; "auto" takes CUDA where there is one.
         threads: of torch; as many processes look at clouds.
         report_every: time between lines of progress [s].
@@ -88,6 +89,7 @@ class TrainFacingConfig(Settings):
         epochs=15, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
     )
     seed: Annotated[int, Field(ge=0)] = 0
+    init_from: str | None = None
     device: str = "auto"
     threads: _Count = 2
     report_every: Annotated[float, Field(gt=0.0)] = 20.0
@@ -135,6 +137,8 @@ def _train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         net = FacingNet().to(device)
+    if config.init_from is not None:
+        net.load_state_dict(PointPillars.named(config.init_from).facing.state_dict())
     learner = Learner(net, optimisation, state)
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     metrics: dict[str, float] = {}
@@ -166,7 +170,7 @@ def _examples(
     """What the detector finds in the training or the validation split, on `device`."""
     split = config.data.validation_split if measured else config.data.split
     described = {
-        **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "workers"}),
+        **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "uses", "workers"}),
         "split": split,
         "seed": config.seed,
         "episodes": config.validation_episodes if measured else config.episodes,

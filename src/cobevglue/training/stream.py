@@ -41,6 +41,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
         batch_size: int,
         seed: int,
         pool: int,
+        uses: int = 1,
         rank: int = 0,
         processes: int = 1,
     ) -> None:
@@ -54,12 +55,14 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
             batch_size: items in a batch; the data loader must use the same, and workers take turns batch by batch.
             seed: of order and augmentation.
             pool: episodes that are shuffled together.
+            uses: how often each sample is prepared.
             rank: number of this process ...
             processes: ... of so many.
         """
         self._source, self._prepare = source, prepare
         self._epochs, self._batches_per_epoch, self._batch_size = epochs, batches_per_epoch, batch_size
-        self._seed, self._pool, self._rank, self._processes = seed, pool, rank, processes
+        self._seed, self._pool, self._uses = seed, pool, uses
+        self._rank, self._processes = rank, processes
 
     def __iter__(self) -> Iterator[Item]:
         info = get_worker_info()
@@ -78,7 +81,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
         episode_size = 0
         for remaining in range(count, 0, -1):
             while len(pool) < remaining and len(pool) <= (self._pool - 1) * episode_size:
-                new = next(episodes)
+                new = next(episodes) * self._uses
                 pool.extend(new)
                 episode_size = len(new)
             chosen = int(random.integers(len(pool)))
