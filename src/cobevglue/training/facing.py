@@ -172,12 +172,14 @@ def _examples(
     described = {
         **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "uses", "workers"}),
         "split": split,
+        "precision": config.optimisation.precision,
         "seed": config.seed,
         "episodes": config.validation_episodes if measured else config.episodes,
     }
     source = make_source(config.data, config.seed, validation=measured)
     folder = config.examples / split
-    return write_facing_examples(folder, source, described, detector, config.threads, device, report).to(device)
+    look = autocast(config.optimisation, device)
+    return write_facing_examples(folder, source, described, detector, config.threads, look, device, report).to(device)
 
 
 def _train_epoch(

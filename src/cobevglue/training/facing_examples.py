@@ -79,6 +79,7 @@ def write_facing_examples(
     config: Mapping[str, Any],
     detector: PointPillars,
     processes: int,
+    autocast: torch.autocast,
     device: torch.device,
     report: Callable[[str], None],
 ) -> FacingExamples:
@@ -91,7 +92,8 @@ def write_facing_examples(
             `examples_in`.
         detector: in evaluation mode.
         processes: how many look at episodes side by side.
-        device: where the detector looks.
+        autocast: the precision that the detector looks in.
+        device: where it looks.
         report: takes lines of progress.
 
     Raises:
@@ -105,16 +107,23 @@ def write_facing_examples(
 
     first_look = nn.ModuleList([detector.pillars, detector.backbone, detector.neck, detector.head])
     settings = {"config": dict(config), "detector": fingerprint(first_look)}
-    write = partial(_write, folder, source, detector, device, config["min_points"])
+    write = partial(_write, folder, source, detector, autocast, device, config["min_points"])
     write_shards(folder, settings, episodes, write, processes, progress)
     return _read(folder)
 
 
 def _write(
-    folder: Path, source: EpisodeSource, detector: PointPillars, device: torch.device, min_points: int, episode: int
+    folder: Path,
+    source: EpisodeSource,
+    detector: PointPillars,
+    autocast: torch.autocast,
+    device: torch.device,
+    min_points: int,
+    episode: int,
 ) -> list[str]:
     detector.to(device)  # here: another process cannot be sent what lies on a GPU
-    examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
+    with autocast:
+        examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
     if not examples:
         return []
     looks = {
