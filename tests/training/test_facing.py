@@ -75,6 +75,15 @@ def test_training_changes_the_second_look_alone(examples: Path, tmp_path: Path) 
     assert len(totals) == 2
 
 
+def test_it_may_start_from_another_detectors_second_look(examples: Path, tmp_path: Path) -> None:
+    """At a learning rate of next to nothing it ends where it started."""
+    slow = OptimisationConfig(epochs=1, samples_per_epoch=16, batch_size=16, learning_rate=1e-12, weight_decay=0.0)
+    train_facing(config(examples, optimisation=slow, init_from="compact"), tmp_path, report=silent)
+    theirs = PointPillars.pretrained("compact").facing.state_dict()
+    for name, value in PointPillars.load(tmp_path / "last.safetensors").facing.state_dict().items():
+        assert torch.allclose(value, theirs[name], atol=1e-8)
+
+
 def test_a_resumed_run_ends_as_one_that_was_never_interrupted(examples: Path, tmp_path: Path) -> None:
     train_facing(config(examples), tmp_path / "whole", report=silent)
 

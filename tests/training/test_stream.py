@@ -33,7 +33,9 @@ def tell(sample: LabelledCloud, random: np.random.Generator) -> tuple[int, int, 
 Batches = list[list[tuple[int, int, float]]]
 
 
-def read(first: int, last: int, workers: int, per_epoch: int = 5, rank: int = 0, processes: int = 1) -> Batches:
+def read(
+    first: int, last: int, workers: int, per_epoch: int = 5, rank: int = 0, processes: int = 1, uses: int = 1
+) -> Batches:
     """The batches of two items of epochs first ... last - 1."""
     stream = EpisodeStream(
         Numbers(),
@@ -43,6 +45,7 @@ def read(first: int, last: int, workers: int, per_epoch: int = 5, rank: int = 0,
         batch_size=2,
         seed=4,
         pool=2,
+        uses=uses,
         rank=rank,
         processes=processes,
     )
@@ -73,6 +76,14 @@ def test_no_sample_comes_twice(workers: int, processes: int) -> None:
     parts = [read(0, 2, workers, rank=rank, processes=processes) for rank in range(processes)]
     samples = [(episode, number) for part in parts for batch in part for episode, number, _ in batch]
     assert len(samples) == len(set(samples)) == 2 * 5 * 2 * processes
+
+
+def test_a_sample_is_used_as_often_as_asked_for_and_differently_each_time() -> None:
+    """24 items are two uses of twelve samples, which is four episodes: no fifth is made."""
+    items = [item for batch in read(0, 1, 0, per_epoch=12, uses=2) for item in batch]
+    samples = [item[:2] for item in items]
+    assert {sample: samples.count(sample) for sample in samples} == {(e, n): 2 for e in range(4) for n in range(3)}
+    assert len({drawn for *_, drawn in items}) == 24
 
 
 def test_samples_of_several_episodes_are_shuffled_together() -> None:

@@ -20,7 +20,7 @@ SIMULATED = "simulated"
 SEED = 2406
 """Of simulated drives and of everything that goes wrong in them; nothing was trained, tuned or tried on this one."""
 
-_SIMULATED_DRIVES, _SIMULATED_FRAMES = 20, 20
+_SIMULATED_DRIVES, _SIMULATED_FRAMES = 24, 20  # two on each of the test networks
 _AGENTS = (2, 3)
 """Of simulated drives, in turn."""
 
@@ -34,7 +34,7 @@ class StudySettings(Settings):
         dataset: name in `DATASETS`, or "simulated".
         root: of the data set; None for simulated drives.
         split: name of the split.
-        scenarios: so many at most; None for all, 20 of simulated ones.
+        scenarios: so many at most; None for all, 24 of simulated ones.
         frames: of each scenario, from its beginning, so many at most; None for all, 20 of simulated ones.
         seed: of all that is random.
         detector: a shipped model's name, or a .safetensors file.
