@@ -91,7 +91,7 @@ def speed(detector: PointPillars, clouds: list[np.ndarray], repeats: int) -> Non
 
             print(f"network, {precision}, {size} at once: {timed(forward, device, repeats) / size:.2f} ms a cloud")
     perception, stages = Perception(detector), []
-    for number in range(repeats):
+    for number in range(repeats + 3):
         start = time.perf_counter()
         seconds = perception.step(clouds[number % len(clouds)]).seconds
         stages.append({**seconds, "all": time.perf_counter() - start})

@@ -328,10 +328,16 @@ def test_bench_times_every_step(
     assert list(stages) == ["load", "pillars", "backbone", "head", "boxes", "facing", "tracking", "all"]
     assert all(0 < timed["best_ms"] <= timed["median_ms"] for timed in stages.values())
     assert report["perception"]["points"] > 10_000
+    assert report["perception"]["weights"] == "compact"
     for step, timed in report["steps"].items():
         assert 0 < timed["5"]["best_ms"] <= timed["5"]["median_ms"]
         assert timed["5"]["repeats"] >= 1
         assert (timed["8"] is None) == step.startswith("paper"), "what would take too long is left out, and said so"
+
+
+def test_bench_of_weights_that_are_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--weights", "compcat"]) == 2
+    assert "compcat" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_an_object_list_of_the_api_is_an_input(tmp_path: Path) -> None:

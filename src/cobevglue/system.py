@@ -69,7 +69,7 @@ class CoBEVGlue:
         """The system on the weights that come with the package.
 
         Args:
-            name: of the detector, "compact".
+            name: of the detector: "compact", or "opv2v", for which fusion has to be "late", "early" or "none".
             fusion: a name in `FUSION_METHODS`.
             aligner: a name in `ALIGNERS`; None for the one that the method's paper has.
 

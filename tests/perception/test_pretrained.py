@@ -20,9 +20,14 @@ FRAMES = 6
 """Frames of the real drive that are looked at; the first has no cloud."""
 
 
+@pytest.fixture(scope="module", params=sorted(CONFIGS))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.fixture(scope="module")
-def detector() -> PointPillars:
-    return PointPillars.pretrained("compact")
+def detector(name: str) -> PointPillars:
+    return PointPillars.pretrained(name)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +36,8 @@ def drive(culver_city: Path) -> Scenario:
     return Scenario(scenario.name, FRAMES, lambda index: scenario[index])
 
 
-def test_they_are_of_the_configuration_they_are_called_by(detector: PointPillars) -> None:
-    assert detector.config == CONFIGS["compact"]
+def test_they_are_of_the_configuration_they_are_called_by(name: str, detector: PointPillars) -> None:
+    assert detector.config == CONFIGS[name]
     assert not detector.training
 
 

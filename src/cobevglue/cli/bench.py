@@ -12,6 +12,7 @@ __all__ = ["bench"]
 
 
 def bench(
+    weights: Annotated[str, typer.Option(help="Of the detector: a shipped name, or a .safetensors file.")] = "compact",
     threads: Annotated[int, typer.Option(min=1, help="Of the detector's network.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
@@ -19,14 +20,14 @@ def bench(
 
     Best and median of repeated frames of two agents that share 60 % of their objects; compilation is not counted. A
     first frame is searched without knowing anything; later frames use what was found before. Perception, from a stored
-    cloud to tracked boxes, is measured where torch and the simulation are installed.
+    cloud to tracked boxes, is measured where torch and the simulation are installed, on CUDA if there is one.
     """
     print_note("the first run compiles for some seconds …")
     from cobevglue.cli.measure import OBJECT_COUNTS, STEPS, measure
     from cobevglue.cli.measure_perception import measure_perception
 
     print_note("perception …")
-    perception = measure_perception(threads)
+    perception = measure_perception(weights, threads)
     report = measure(lambda count: print_note(f"{count} objects …"))
     report["perception"] = perception
     if as_json:
@@ -46,7 +47,7 @@ def bench(
         print_note("perception is left out: pip install 'cobevglue[perception,simulation]'")
     else:
         stages = [(name, f"{t['median_ms']:.1f}", f"{t['best_ms']:.1f}") for name, t in perception["stages"].items()]
-        title = f"One cloud of {perception['points']} points, weights compact, {perception['threads']} threads"
+        title = "One cloud of {points} points, weights {weights}, {device}, {threads} threads".format(**perception)
         print_table(title, ("stage, milliseconds", "median", "best"), stages)
         if perception["largest_memory_mb"] is not None:
             print(f"largest memory of the process up to here: {perception['largest_memory_mb']:.0f} MB")

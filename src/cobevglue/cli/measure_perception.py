@@ -1,4 +1,4 @@
-"""Times the steps between a stored point cloud and tracked boxes, with the detector that comes with the package."""
+"""Times the steps between a stored point cloud and tracked boxes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,23 @@ _WARM_UP = 3
 _NETWORK, _SEED = "junction_test_0", 0
 
 
-def measure_perception(threads: int) -> dict[str, Any] | None:
+def measure_perception(weights: str, threads: int) -> dict[str, Any] | None:
     """Time every stage of perception on simulated clouds of OPV2V's sensor.
 
     Args:
+        weights: of the detector, a shipped name or a .safetensors file. It runs on CUDA where there is one.
         threads: of torch.
 
     Returns:
-        Ready for JSON: `stages[stage]` with `median_ms` and `best_ms`; how many points a cloud had, the threads, and
-        the largest memory of this process so far. None where torch or the simulation is not installed.
+        Ready for JSON: `stages[stage]` with `median_ms` and `best_ms`; how many points a cloud had, the weights, the
+        device, the threads, and the largest memory of this process so far. None where torch or the simulation is not
+        installed.
+
+    Raises:
+        ValueError, FileNotFoundError: there are no such weights.
     """
     try:
-        import torch  # noqa: F401  # where it is missing, this says so in the way that is expected below
+        import torch
 
         from cobevglue.datasets.opv2v_writer import write_opv2v_frame
         from cobevglue.datasets.pcd import read_pcd
@@ -37,11 +42,12 @@ def measure_perception(threads: int) -> dict[str, Any] | None:
         from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
         from cobevglue.torch_threads import torch_threads
 
+        detector = PointPillars.named(weights).to("cuda" if torch.cuda.is_available() else "cpu")
         snapshots = EpisodeSettings(snapshots=4, agents=5, vary_sensor=False)
         clouds = SimulatedEpisodes("test", _SEED, snapshots).episode(0)
     except ModuleNotFoundError:
         return None
-    perception = Perception(PointPillars.pretrained("compact"))
+    perception = Perception(detector)
     taken: list[dict[str, float]] = []
     with torch_threads(threads), tempfile.TemporaryDirectory() as folder:
         for number, cloud in enumerate(clouds):
@@ -63,6 +69,8 @@ def measure_perception(threads: int) -> dict[str, Any] | None:
             for stage in timed[0]
         },
         "points": round(statistics.mean(len(cloud.points) for cloud in clouds)),
+        "weights": weights,
+        "device": str(detector.device),
         "threads": threads,
         "largest_memory_mb": _largest_memory(),
     }
