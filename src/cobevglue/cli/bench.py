@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from cobevglue.cli.errors import expected_errors
 from cobevglue.cli.output import print_json, print_note, print_table
 
 __all__ = ["bench"]
@@ -27,7 +28,8 @@ def bench(
     from cobevglue.cli.measure_perception import measure_perception
 
     print_note("perception …")
-    perception = measure_perception(weights, threads)
+    with expected_errors():
+        perception = measure_perception(weights, threads)
     report = measure(lambda count: print_note(f"{count} objects …"))
     report["perception"] = perception
     if as_json:
