@@ -1,4 +1,4 @@
-"""Rebuild the road networks stored in `cobevglue.simulation`: six kinds, each in several seeded variants.
+"""Rebuild the road networks stored in `cobevglue.simulation`: seven kinds, each in several seeded variants.
 
     pip install eclipse-sumo && python tools/build_networks.py
 
@@ -38,6 +38,8 @@ class Plan:
     nodes: list[str] = field(default_factory=list)
     edges: list[str] = field(default_factory=list)
     connections: list[str] = field(default_factory=list)
+    last_part: dict[str, str] = field(default_factory=dict)
+    """What netconvert calls the last part of an edge that is split."""
 
     def node(self, name: str, xy: FloatArray, **attributes: object) -> None:
         """A place where roads begin, meet or end."""
@@ -53,20 +55,21 @@ class Plan:
         speed: float,
         width: float,
         split: float = 0.0,
-        pocket: bool = False,
+        pocket: int = 0,
         priority: int = 5,
     ) -> None:
         """A directed road, perhaps of two edges: split so far before its end, or after its start if negative.
 
         SUMO gives all lanes of one edge the same length. Where only a part of an edge bends, vehicles that change lanes
-        would therefore jump ahead or back; splitting it where the bend begins avoids that. With a `pocket` the leftmost
-        lane exists only after the split.
+        would therefore jump ahead or back; splitting it where the bend begins avoids that. `pocket` of the leftmost
+        lanes exist only after the split.
         """
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
         splits = ""
         if split:
-            before, after = (" ".join(str(lane) for lane in range(lanes - closed)) for closed in (pocket, False))
+            before, after = (" ".join(str(lane) for lane in range(lanes - closed)) for closed in (pocket, 0))
             splits = _element("split", pos=0, lanes=before) + _element("split", pos=f"{-split:.2f}", lanes=after)
+            self.last_part[name] = f"{name}.{math.trunc(-split)}"
         ends = {"from": start, "to": end, "shape": points, "numLanes": lanes, "priority": priority}
         text = _element("edge", id=name, **ends, speed=f"{speed:.2f}", width=f"{width:.2f}")
         self.edges.append(text[:-2] + ">" + splits + "</edge>" if splits else text)
@@ -251,6 +254,29 @@ def town(rng: np.random.Generator, variant: int) -> Plan:
     return plan
 
 
+def crossing(rng: np.random.Generator, variant: int) -> Plan:
+    """Two wide streets that cross at signals; one or two lanes for turning left on each arm, facing the opposite ones.
+
+    The middle line of a street gives way for them, on either side of the crossing the other way. So what comes the
+    other way is not left of the middle line that a driver sees ahead of him, as it is in a `junction`.
+    """
+    plan = Plan()
+    plan.node("c", np.zeros(2), type="traffic_light")
+    angles = np.arange(4) * math.pi / 2 + rng.uniform(-0.15, 0.15, 4) + rng.uniform(0, math.pi / 2)
+    width = rng.uniform(3.1, 3.5)
+    through = rng.integers(2, 4, size=2)
+    turning = 1 + variant % 2, int(rng.integers(1, 3))
+    for arm, angle in enumerate(angles):
+        ahead, left, beside = int(through[arm % 2]), turning[arm % 2], int(through[1 - arm % 2])
+        aside = width * (left / 2 + rng.uniform(0.0, 0.5))
+        _arm(plan, f"{arm}", angle, rng, ahead, width, float(rng.uniform(40, 70)), left, aside)
+        near = plan.last_part[f"in{arm}"]
+        plan.connect(near, f"out{(arm + 1) % 4}", (0, 0))
+        plan.connect(near, f"out{(arm + 2) % 4}", *((lane, lane) for lane in range(ahead)))
+        plan.connect(near, f"out{(arm + 3) % 4}", *((ahead + k, beside - left + k) for k in range(left)))
+    return plan
+
+
 _BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
     "junction": junction,
     "t_junction": t_junction,
@@ -258,6 +284,7 @@ _BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
     "highway": highway,
     "residential": residential,
     "town": town,
+    "crossing": crossing,
 }
 
 
@@ -285,14 +312,22 @@ def _arm(
     lanes: int,
     width: float,
     pocket: float,
+    turning: int = 1,
+    aside: float = 0.0,
     priority: int = 5,
 ) -> None:
-    """A road of `lanes` each way from the node "c" outwards, straight or curved."""
+    """A road of `lanes` each way from the node "c" outwards, straight or curved.
+
+    For so long a `pocket` there are more for `turning` left, and its middle line is that far `aside` for them.
+    """
     curvature = float(rng.choice([0.0, 1.0, -1.0])) * rng.uniform(1 / 500, 1 / 180)
     straight, end = pocket or 50.0, f"n{name}"
     line = _line(0.0, _EXTENT, angle, curvature, straight)
     plan.node(end, line[-1])
-    arriving, more = line[::-1], bool(pocket)
+    if aside:
+        along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
+        line = _shifted(line, aside * (1.0 + np.cos(np.pi * np.clip((along - straight) / 40.0 - 0.3, 0.0, 1.0))) / 2.0)
+    arriving, more = line[::-1], turning if pocket else 0
     plan.edge(f"in{name}", end, "c", arriving, lanes + more, _TOWN, width, straight, more, priority=priority)
     plan.edge(f"out{name}", "c", end, line, lanes, _TOWN, width, -straight, priority=priority)
 
@@ -326,11 +361,11 @@ def _cut(line: FloatArray, shares: FloatArray) -> list[FloatArray]:
     return pieces
 
 
-def _shifted(line: FloatArray, right: float) -> FloatArray:
-    """A line moved to its right."""
+def _shifted(line: FloatArray, right: float | FloatArray) -> FloatArray:
+    """A line moved to its right, everywhere alike or (N,) point by point."""
     tangent = np.gradient(line, axis=0)
     tangent /= np.hypot(*tangent.T)[:, None]
-    moved: FloatArray = line + right * np.column_stack([tangent[:, 1], -tangent[:, 0]])
+    moved: FloatArray = line + np.reshape(right, (-1, 1)) * np.column_stack([tangent[:, 1], -tangent[:, 0]])
     return moved
 
 

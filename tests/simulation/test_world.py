@@ -66,7 +66,7 @@ def test_slope_is_the_derivative_of_height() -> None:
 
 @pytest.mark.parametrize("kind", NETWORK_KINDS)
 def test_parked_vehicles_are_beside_the_road_and_not_in_each_other(kind: str) -> None:
-    roads = RoadNetwork.load(f"{kind}_test_0")
+    roads = RoadNetwork.load(f"{kind}_validation_0")
     parked = World(roads.name, seed=1).parked
     if len(parked):
         assert roads.distance_to_road(parked.center[:, :2]).min() > 0.5
@@ -88,7 +88,7 @@ def test_on_highways_nobody_parks() -> None:
 @pytest.mark.parametrize("kind", NETWORK_KINDS)
 def test_nothing_solid_stands_on_the_road(kind: str) -> None:
     """No triangle corner between bumper and roof height is more than half a metre inside the road."""
-    roads = RoadNetwork.load(f"{kind}_test_0")
+    roads = RoadNetwork.load(f"{kind}_validation_0")
     scenery = build_scenery(roads, np.random.default_rng(2))
     corners = scenery.mesh.triangles.reshape(-1, 3)
     above = corners[:, 2] - scenery.ground.height(corners[:, :2])

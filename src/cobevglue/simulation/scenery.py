@@ -113,7 +113,8 @@ class _Builder:
             built_up *= 0.3
         if self.roads.kind == "residential":
             parking = max(parking, 0.25)
-        nobody_parks = self.roads.kind == "highway" or (self.roads.kind == "town" and rng.random() < 0.5)
+        wide = self.roads.kind in ("town", "crossing")
+        nobody_parks = self.roads.kind == "highway" or (wide and rng.random() < 0.5)
         self._lay_ground()
         pavement = float(rng.uniform(1.2, 4.5))
         if self.roads.kind != "highway" or rng.random() < 0.3:
