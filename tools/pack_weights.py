@@ -4,8 +4,8 @@
 
 Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
 of each, commit, command and settings are kept. The training of a second look (`train facing`) keeps those of its
-detector by itself. How boxes are chosen is no part of training, and is taken from
-`CONFIGS`.
+detector by itself; `--second-look` takes that of another file. How boxes are chosen is no part of training, and is
+taken from `CONFIGS`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ def main() -> None:
     parser.add_argument("name", choices=sorted(CONFIGS))
     parser.add_argument("weights", type=Path)
     parser.add_argument("started_from", type=Path, nargs="*")
+    parser.add_argument("--second-look", type=Path)
     arguments = parser.parse_args()
     trained = PointPillars.load(arguments.weights)
     config = CONFIGS[arguments.name]
@@ -32,14 +33,20 @@ def main() -> None:
         raise SystemExit(f"{arguments.weights}: is not of the configuration {arguments.name}")
     detector = PointPillars(config)
     detector.load_state_dict(trained.state_dict())
+    last = trained.metadata
     stages: list[dict[str, Any]] = []
     for path in arguments.started_from:
         metadata = PointPillars.load(path).metadata
         stages += metadata.get("stages", [metadata])
     WEIGHTS.mkdir(exist_ok=True)
     file = WEIGHTS / f"{arguments.name}.safetensors"
-    stages += trained.metadata.pop("stages", [])
-    detector.save(file, {"stages": [*stages, trained.metadata]}, half=True)
+    stages += last.pop("stages", [])
+    if arguments.second_look is not None:
+        stages.append(last)
+        looking = PointPillars.load(arguments.second_look)
+        detector.facing.load_state_dict(looking.facing.state_dict())
+        last = {key: value for key, value in looking.metadata.items() if key != "stages"}
+    detector.save(file, {"stages": [*stages, last]}, half=True)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
 
 

@@ -67,7 +67,7 @@ def test_junctions_have_signals(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in ALL if name.startswith(("crossing", "junction"))])
 def test_at_crossings_lanes_for_turning_left_face_each_other(name: str) -> None:
-    """The middle is straight ahead of the leftmost lane or right of that; at a junction it is half a lane to its left."""
+    """The middle is ahead of the leftmost lane or right of that; at a junction it is half a lane to its left."""
     roads = RoadNetwork.load(name)
     leftmost = {lane.edge: lane for lane in roads.lanes if lane.edge.startswith("in") and "." in lane.edge}
     assert len(leftmost) == 4
