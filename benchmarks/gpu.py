@@ -37,22 +37,13 @@ def main() -> None:
     print(f"{time.strftime('%Y-%m-%d')}, {name}, {os.cpu_count()} cores, torch {torch.__version__}")
     clouds = [cloud.points for cloud in SimulatedEpisodes("validation").episode(0)][:16]
     for model in arguments.models:
-        detector = random_or_trained(model)
+        detector = PointPillars.named(model)
         print(f"\n## {model}\n")
         agreement(detector, clouds, device)
         speed(detector.to(device), clouds, arguments.repeats)
         if model in CONFIGS:
             for batch in arguments.batch:
                 training(model, batch, device, arguments.repeats)
-
-
-def random_or_trained(model: str) -> PointPillars:
-    """The detector of this name or file; with random weights where none come with the package."""
-    try:
-        return PointPillars.named(model)
-    except ValueError:
-        print(f"no weights of {model}: random ones")
-        return PointPillars(CONFIGS[model]).eval()
 
 
 def agreement(detector: PointPillars, clouds: list[np.ndarray], device: torch.device) -> None:

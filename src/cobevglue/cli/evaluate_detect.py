@@ -116,9 +116,9 @@ def _load_detector(weights: str) -> PointPillars:
         from cobevglue.perception import PointPillars
     except ImportError as error:
         raise InputError(str(error)) from error
-    import torch
+    from cobevglue.torch_device import chosen_device
 
-    return PointPillars.named(weights).to("cuda" if torch.cuda.is_available() else "cpu")
+    return PointPillars.named(weights).to(chosen_device())
 
 
 def _evaluation_range(task: DetectTask, detector: PointPillars) -> EvaluationRange:

@@ -15,6 +15,7 @@ from cobevglue.experiments.study import StudySettings
 from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion
 from cobevglue.perception import PointPillars
 from cobevglue.perception.checkpoint import fingerprint
+from cobevglue.torch_device import chosen_device
 
 __all__ = ["Models"]
 
@@ -38,8 +39,7 @@ class Models:
 
     def __init__(self, settings: StudySettings) -> None:
         self._settings = settings
-        detector = PointPillars.named(settings.detector)
-        self.detector = detector.to("cuda" if torch.cuda.is_available() else "cpu")
+        self.detector = PointPillars.named(settings.detector).to(chosen_device())
         self._methods: dict[str, FusionMethod] = {}
         self._fingerprints: dict[str, str] = {}
 

@@ -16,13 +16,13 @@ from torch import Tensor
 from cobevglue.perception import PointPillars
 from cobevglue.perception.facing import FacingNet, Looks
 from cobevglue.settings import Settings
+from cobevglue.torch_device import chosen_device
 from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import TrainingResult
 from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
-from cobevglue.training.processes import chosen_device
 from cobevglue.training.progress import EpochProgress
 from cobevglue.training.run_log import RunLog, print_progress
 from cobevglue.training.sources import make_source

@@ -11,7 +11,9 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-__all__ = ["Processes", "chosen_device", "process_group"]
+from cobevglue.torch_device import chosen_device
+
+__all__ = ["Processes", "process_group"]
 
 
 @dataclass(frozen=True)
@@ -48,25 +50,6 @@ class Processes:
         values = [value]
         dist.broadcast_object_list(values)
         return values[0]
-
-
-def chosen_device(device: str) -> torch.device:
-    """The device of this name; under `torchrun`, CUDA is each process's own.
-
-    Args:
-        device: "auto" (CUDA where there is one), or torch's name of a device.
-
-    Raises:
-        ValueError: there is no such device.
-    """
-    name = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    if name == "cuda" and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        name = f"cuda:{int(os.environ['LOCAL_RANK'])}"
-    try:
-        return torch.zeros(1, device=name).device
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        first_line = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"device {device!r} cannot be used: {first_line}") from None
 
 
 @contextmanager
