@@ -74,7 +74,7 @@ def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars) -> Detection
     """What the detector's settings make of its network's output."""
     assert cloud.points is not None
     (found,) = detector.boxes(output)
-    boxes = detector.faced(found, cloud.points).boxes
+    boxes = detector.refine_headings(found, cloud.points).boxes
     return DetectionFrame(boxes, cloud.truth, cloud.point_count, cloud.frame, cloud.agent)
 
 

@@ -98,7 +98,7 @@ def training(model: str, batch: int, device: torch.device, repeats: int) -> None
     samples = SimulatedEpisodes("train").episode(0)
     items = ready.collate([ready.prepare(samples[i % len(samples)], random) for i in range(batch)])
     detector = PointPillars(config.model).to(device).train()
-    detector.facing.requires_grad_(False)
+    detector.heading_refiner.requires_grad_(False)
     loss, learner = DetectionLoss(config.model), Learner(detector, config.optimisation)
 
     def step() -> None:

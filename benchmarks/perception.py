@@ -3,7 +3,7 @@
     python benchmarks/perception.py                    # everything below, about 10 minutes on two cores
     python benchmarks/perception.py --only real        # OPV2V clouds: average precision, headings, what is missed
     python benchmarks/perception.py --only simulated   # the simulated test split
-    python benchmarks/perception.py --only headings    # front and back, by the head, by the second look, by tracks
+    python benchmarks/perception.py --only headings    # front and back, by the head, by heading refinement, by tracks
     python benchmarks/perception.py --only alignment   # BEVGlue on the detections of two real OPV2V agents
     python benchmarks/perception.py --only speed       # each stage, and memory
     python benchmarks/perception.py --weights runs/compact/last.safetensors
@@ -112,10 +112,12 @@ def vars_of(errors: object) -> dict[str, float]:
 
 def headings(detector: PointPillars, data: Path, split: str) -> None:
     """Which share of true positives (IoU 0.5, score >= 0.3) is the wrong way round, in drives at 10 Hz."""
-    print("\n## Headings\n\n| clouds | true positives | head alone | second look | and tracked | head, tracked |")
+    print(
+        "\n## Headings\n\n| clouds | true positives | head alone | heading refinement | and tracked | head, tracked |"
+    )
     print("|---|---|---|---|---|---|")
     once = copy.deepcopy(detector)
-    once.detection = detector.detection.model_copy(update={"second_look": False})
+    once.detection = detector.detection.model_copy(update={"heading_refinement": False})
     drives = {
         f"OPV2V {SCENARIO}": [OPV2V(data, "test_culvercity")[SCENARIO]],
         f"simulated {split} split, {DRIVES} drives": simulated_scenarios(split, DRIVES, settings=DRIVE),

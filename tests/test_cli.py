@@ -325,7 +325,7 @@ def test_bench_times_every_step(
     report = json.loads(out)
     assert report["message_bytes"] == {"5": 28 + 5 * 32, "8": 28 + 8 * 32}
     stages = report["perception"]["stages"]
-    assert list(stages) == ["load", "pillars", "backbone", "head", "boxes", "facing", "tracking", "all"]
+    assert list(stages) == ["load", "pillars", "backbone", "head", "boxes", "heading", "tracking", "all"]
     assert all(0 < timed["best_ms"] <= timed["median_ms"] for timed in stages.values())
     assert report["perception"]["points"] > 10_000
     assert report["perception"]["weights"] == "compact"

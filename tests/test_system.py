@@ -56,12 +56,12 @@ class Fixed(GroupAligner):
 
     def __init__(self, poses: Mapping[str, SE2]) -> None:
         self.poses = poses
-        self.seen: dict[str, Observation] = {}
+        self.observations: dict[str, Observation] = {}
 
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
     ) -> dict[str, Alignment]:
-        self.seen = dict(observations)
+        self.observations = dict(observations)
         names = [name for name in observations if name != ego]
         return {n: Alignment(self.poses[n]) if n in self.poses else Alignment.refused("unknown") for n in names}
 
@@ -194,7 +194,7 @@ def test_an_aligner_is_given_what_it_needs_and_nothing_else() -> None:
     aligner = Fixed({})
     system = CoBEVGlue(detector, method("none", detector), aligner)
     system.step({"a": cloud(1), "b": cloud(2)}, "a", poses={"a": np.eye(4), "b": np.eye(4)})
-    for seen in aligner.seen.values():
+    for seen in aligner.observations.values():
         assert seen.boxes is not None
         assert (seen.pose, seen.points, seen.features, seen.variance) == (None, None, None, None)
 

@@ -185,7 +185,7 @@ def test_boxes_face_as_most_of_their_track_did(seen: str, told: str) -> None:
     tracker = Sort()
     for k, (flipped, expected) in enumerate(zip(seen, told, strict=True)):
         boxes = cars([(k, 0), (0, 15)], [10 * k + 180 * (flipped == "!"), 90])
-        faced = tracker.faced(tracker.update(boxes))
+        faced = tracker.vote_headings(tracker.update(boxes))
         right = wrap_angle(np.radians([10 * k + 180 * (expected == "!"), 90]))
         np.testing.assert_allclose(np.cos(faced.yaw - right), 1.0, atol=1e-9)
         np.testing.assert_array_equal(faced.center, boxes.center)
@@ -195,15 +195,15 @@ def test_one_that_is_sure_outvotes_two_that_are_not() -> None:
     tracker = Sort()
     told = []
     for flipped, sure in ((False, 0.9), (True, 0.2), (True, 0.2), (False, 0.9), (True, 1.0), (True, 1.0)):
-        boxes = tracker.update(cars([(0, 0)], 180 * flipped), sure=np.array([sure]))
-        told.append(bool(np.cos(tracker.faced(boxes).yaw[0]) < 0))
+        boxes = tracker.update(cars([(0, 0)], 180 * flipped), heading_confidence=np.array([sure]))
+        told.append(bool(np.cos(tracker.vote_headings(boxes).yaw[0]) < 0))
     assert told == [False, False, False, False, False, True]
 
 
 @pytest.mark.parametrize("sure", [[0.5], [0.5, 1.1], [0.5, -0.1], [0.5, np.nan], [[0.5, 0.5]]])
 def test_bad_votes_are_refused_and_change_nothing(sure: object) -> None:
     tracker = Sort()
-    with pytest.raises(ValueError, match=r"sure must be 2 numbers in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"heading_confidence must be 2 numbers in \[0, 1\]"):
         tracker.update(cars([(0, 0), (0, 15)]), 5.0, np.array(sure))
     assert len(tracker.tracks.boxes) == 0
     tracker.update(cars([(0, 0), (0, 15)]), 1.0)  # time did not go on
@@ -212,11 +212,11 @@ def test_bad_votes_are_refused_and_change_nothing(sure: object) -> None:
 def test_only_boxes_of_the_last_update_can_be_faced() -> None:
     tracker = Sort()
     boxes = tracker.update(cars([(0, 0), (0, 15)]))
-    assert tracker.faced(boxes[[1]]).track_id is not None
-    assert len(tracker.faced(boxes[:0])) == 0
+    assert tracker.vote_headings(boxes[[1]]).track_id is not None
+    assert len(tracker.vote_headings(boxes[:0])) == 0
     for wrong in (cars([(0, 0)]), boxes.replace(track_id=[0, 7])):
         with pytest.raises(ValueError, match="track_id of living tracks"):
-            tracker.faced(wrong)
+            tracker.vote_headings(wrong)
 
 
 def test_a_turn_through_north_is_followed() -> None:

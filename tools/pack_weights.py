@@ -3,8 +3,8 @@
     python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
 
 Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
-of each, commit, command and settings are kept. The training of a second look (`train facing`) keeps those of its
-detector by itself; `--second-look` takes that of another file. How boxes are chosen is no part of training, and is
+of each, commit, command and settings are kept. The training of heading refinement (`train heading`) keeps those of its
+detector by itself; `--heading-refiner` takes that of another file. How boxes are chosen is no part of training, and is
 taken from `CONFIGS`.
 """
 
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("name", choices=sorted(CONFIGS))
     parser.add_argument("weights", type=Path)
     parser.add_argument("started_from", type=Path, nargs="*")
-    parser.add_argument("--second-look", type=Path)
+    parser.add_argument("--heading-refiner", type=Path)
     arguments = parser.parse_args()
     trained = PointPillars.load(arguments.weights)
     config = CONFIGS[arguments.name]
@@ -41,10 +41,10 @@ def main() -> None:
     WEIGHTS.mkdir(exist_ok=True)
     file = WEIGHTS / f"{arguments.name}.safetensors"
     stages += last.pop("stages", [])
-    if arguments.second_look is not None:
+    if arguments.heading_refiner is not None:
         stages.append(last)
-        looking = PointPillars.load(arguments.second_look)
-        detector.facing.load_state_dict(looking.facing.state_dict())
+        looking = PointPillars.load(arguments.heading_refiner)
+        detector.heading_refiner.load_state_dict(looking.heading_refiner.state_dict())
         last = {key: value for key, value in looking.metadata.items() if key != "stages"}
     detector.save(file, {"stages": [*stages, last]}, half=True)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")

@@ -22,7 +22,7 @@ from cobevglue.alignment import group_aligner
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.frame import AgentFrame, Frame
 from cobevglue.datasets.poses import inverse_SE3
-from cobevglue.disturbance import Disturbance, LocalisationNoise, Moment, SamePlace, Undisturbed
+from cobevglue.disturbance import Disturbance, LocalisationNoise, ObservedFrame, SamePlace, Undisturbed
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.evaluation.detection_matching import DROPPED, FALSE, EvaluationRange, inside, match, prepare
 from cobevglue.fusion.none import NoCollaboration
@@ -318,7 +318,7 @@ def _put_together(
 
     seen = dict(zip(scene.points, workers.map(perceive, scene.points), strict=True))
     seconds = {"perception": sum(sum(view.seconds.values()) for view in seen.values())}
-    moment = Moment(scene.time, seen, true, true)
+    moment = ObservedFrame(scene.time, seen, true, true)
 
     def collaborate(row: str) -> StepOutput:
         taking_part = {scene.ego: seen[scene.ego]} if row == EGO_ONLY else seen

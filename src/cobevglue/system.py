@@ -19,7 +19,7 @@ from cobevglue.alignment.group import GroupAligner, Observation
 from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.fusion import FusionMethod, Received, pretrained_fusion
-from cobevglue.fusion.facing import face_as_told
+from cobevglue.fusion.heading import vote_headings
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars
 from cobevglue.typing import ArrayLike, FloatArray
@@ -151,9 +151,9 @@ class CoBEVGlue:
 
         with _timed("fusion", spent):
             boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
-            boxes = face_as_told(boxes, _told(seen[ego], observations, alignments))
+            boxes = vote_headings(boxes, _told(seen[ego], observations, alignments))
             boxes = boxes[~covers_origin(boxes)]  # others see the ego, too
-            boxes = boxes.replace(center=boxes.center - (0.0, 0.0, seen[ego].raised))
+            boxes = boxes.replace(center=boxes.center - (0.0, 0.0, seen[ego].height_correction))
         self._frame += 1
         return StepOutput(boxes, alignments, sent, alignment_bytes, spent)
 
@@ -171,7 +171,7 @@ class CoBEVGlue:
             pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
             whole = Observation(view.boxes, view.variance, view.points, view.features, pose)
             try:
-                needed = self.aligner.look_at(whole)
+                needed = self.aligner.heading_inputs(whole)
             except ValueError as error:
                 raise ValueError(f"{agent}: {error}") from None
             if agent != ego:

@@ -133,7 +133,7 @@ class Sort:
         self._tracks = _State()
         self._frame = _FrameMotion(self.config)
 
-    def update(self, boxes: Boxes, time: float | None = None, sure: FloatArray | None = None) -> Boxes:
+    def update(self, boxes: Boxes, time: float | None = None, heading_confidence: FloatArray | None = None) -> Boxes:
         """Identities for the boxes of the next frame.
 
         The boxes come back as they are, every one and in the same order: detections, not filtered states. What the
@@ -143,18 +143,21 @@ class Sort:
             boxes: N detections in the agent's frame; scores, labels and any `track_id` play no part.
             time: when they were seen [s], on any clock; by default `config.period` after the last update. After a gap
                 longer than `config.max_age` all tracks are new.
-            sure: (N,) from 0 to 1, how sure it is which way each box faces; as sure of all if None.
+            heading_confidence: (N,) in [0, 1] of the direction of each heading (front or back); 1 for all if None.
 
         Returns:
             The N boxes with `track_id`.
 
         Raises:
-            ValueError: `time` is not finite or not later than the last one, or `sure` is not one number in [0, 1] for
-                each box; the tracker is then as it was.
+            ValueError: `time` is not finite or not later than the last one, or `heading_confidence` is not one
+                number in [0, 1] for each box; the tracker is then unchanged.
         """
-        votes = np.ones(len(boxes)) if sure is None else np.asarray(sure, dtype=np.float64)
-        if votes.shape != (len(boxes),) or not ((votes >= 0.0) & (votes <= 1.0)).all():
-            raise ValueError(f"sure must be {len(boxes)} numbers in [0, 1], got shape {votes.shape}: {votes}")
+        votes = np.ones(len(boxes)) if heading_confidence is None else np.asarray(heading_confidence, dtype=np.float64)
+        n = len(boxes)
+        if votes.shape != (n,) or not ((votes >= 0.0) & (votes <= 1.0)).all():
+            raise ValueError(
+                f"heading_confidence must be {len(boxes)} numbers in [0, 1], got shape {votes.shape}: {votes}"
+            )
         time, dt = self._advance(time)
         self._end_lost_tracks(time)
         self._predict(dt)
@@ -163,10 +166,10 @@ class Sort:
         ids = self._begin_new_tracks(rows, boxes, columns, time, votes)
         return boxes.replace(track_id=ids)
 
-    def faced(self, boxes: Boxes) -> Boxes:
-        """Boxes of the last update, each turned by 180 degrees where it faces the other way than its track.
+    def vote_headings(self, boxes: Boxes) -> Boxes:
+        """Boxes of the last update, each rotated by 180 degrees where its heading is opposite to its track's.
 
-        A track faces the way that most of its detections did, later ones and sure ones counting more.
+        The heading of a track is decided by votes of its detections, weighted by recency and heading confidence.
 
         Args:
             boxes: some or all of what `update` returned last, in any order.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cobevglue.boxes import Boxes
-from cobevglue.disturbance import Moment
+from cobevglue.disturbance import ObservedFrame
 from cobevglue.typing import FloatArray
 
 torch = pytest.importorskip("torch")
@@ -37,13 +37,13 @@ def view(tag: float) -> PerceptionOutput:
     return PerceptionOutput(points, features, boxes, np.full((2, 3), 0.1), boxes.replace(track_id=None), {})
 
 
-def drive(frames: int = 20, second_leaves: int = 10_000) -> list[Moment]:
+def drive(length: int = 20, second_leaves: int = 10_000) -> list[ObservedFrame]:
     """`ego` stands, `car2` drives 1 m a frame until frame `second_leaves`, `car3` drives away to the left."""
-    moments = []
-    for i in range(frames):
+    frames = []
+    for i in range(length):
         poses = {"ego": pose(0.0, 0.0), "car2": pose(float(i), 5.0, 0.3), "car3": pose(30.0, 2.0 * i, -1.0)}
         if i >= second_leaves:
             del poses["car2"]
         seen = {agent: view(100.0 * number + i) for number, agent in enumerate(poses)}
-        moments.append(Moment(0.1 * i, seen, poses, poses))
-    return moments
+        frames.append(ObservedFrame(0.1 * i, seen, poses, poses))
+    return frames

@@ -13,14 +13,14 @@ from cobevglue.se2 import SE2
 
 from .drives import KEY, drive
 
-MOMENTS = drive()
+FRAMES = drive()
 
 
 def test_noise_has_the_asked_spread_in_x_y_and_yaw_and_leaves_the_rest() -> None:
-    moments, noise = drive(600), LocalisationNoise(position=1.5, yaw=2.5)
+    frames, noise = drive(600), LocalisationNoise(position=1.5, yaw=2.5)
     errors = []
-    for index, now in enumerate(moments):
-        claimed = noise.apply(moments, index, "ego", KEY).claimed
+    for index, now in enumerate(frames):
+        claimed = noise.apply(frames, index, "ego", KEY).claimed
         errors += [carla_from_SE3(claimed[agent]) - carla_from_SE3(now.true[agent]) for agent in now.true]
     x, y, z, roll, yaw, pitch = np.array(errors).T
     yaw = (yaw + 180.0) % 360.0 - 180.0
@@ -33,7 +33,7 @@ def test_noise_has_the_asked_spread_in_x_y_and_yaw_and_leaves_the_rest() -> None
 def test_noise_is_on_the_ego_too_and_new_in_every_moment_and_of_every_agent() -> None:
     noise = LocalisationNoise(position=1.0, yaw=1.0)
     shifts = [
-        float(noise.apply(MOMENTS, index, "ego", KEY).claimed[agent][0, 3] - MOMENTS[index].true[agent][0, 3])
+        float(noise.apply(FRAMES, index, "ego", KEY).claimed[agent][0, 3] - FRAMES[index].true[agent][0, 3])
         for index in (0, 1)
         for agent in ("ego", "car2", "car3")
     ]
@@ -43,8 +43,8 @@ def test_noise_is_on_the_ego_too_and_new_in_every_moment_and_of_every_agent() ->
 
 def test_the_same_key_gives_the_same_noise_at_every_level_but_for_its_size() -> None:
     def shift(level: float, key: tuple[int, ...] = KEY) -> float:
-        heard = LocalisationNoise(position=level, yaw=level).apply(MOMENTS, 4, "ego", key)
-        return float(heard.claimed["car2"][1, 3] - MOMENTS[4].true["car2"][1, 3])
+        heard = LocalisationNoise(position=level, yaw=level).apply(FRAMES, 4, "ego", key)
+        return float(heard.claimed["car2"][1, 3] - FRAMES[4].true["car2"][1, 3])
 
     assert shift(2.5) == pytest.approx(5.0 * shift(0.5))
     assert shift(0.0) == 0.0
@@ -53,14 +53,14 @@ def test_the_same_key_gives_the_same_noise_at_every_level_but_for_its_size() -> 
 
 def test_noise_of_one_agent_does_not_depend_on_who_else_is_there() -> None:
     noise = LocalisationNoise()
-    alone = noise.apply([moment.without("car2") for moment in MOMENTS], 3, "ego", KEY)
-    np.testing.assert_array_equal(alone.claimed["car3"], noise.apply(MOMENTS, 3, "ego", KEY).claimed["car3"])
+    alone = noise.apply([frame.without("car2") for frame in FRAMES], 3, "ego", KEY)
+    np.testing.assert_array_equal(alone.claimed["car3"], noise.apply(FRAMES, 3, "ego", KEY).claimed["car3"])
 
 
 def test_under_the_attack_everyone_is_where_the_ego_is() -> None:
-    heard = SamePlace().apply(MOMENTS, 5, "ego", KEY)
+    heard = SamePlace().apply(FRAMES, 5, "ego", KEY)
     for claimed in heard.claimed.values():
-        np.testing.assert_array_equal(claimed, MOMENTS[5].true["ego"])
+        np.testing.assert_array_equal(claimed, FRAMES[5].true["ego"])
 
 
 @pytest.mark.parametrize(
@@ -68,20 +68,20 @@ def test_under_the_attack_everyone_is_where_the_ego_is() -> None:
     [(0, 0.0), (4, 0.0), (10, 0.0), (15, 5.0)],
 )
 def test_a_replayed_pose_is_a_second_old_or_the_first_there_is(index: int, x: float) -> None:
-    heard = ReplayedPose(seconds=1.0).apply(MOMENTS, index, "ego", KEY)
+    heard = ReplayedPose(seconds=1.0).apply(FRAMES, index, "ego", KEY)
     assert heard.claimed["car2"][0, 3] == x
-    np.testing.assert_array_equal(heard.claimed["ego"], MOMENTS[index].true["ego"])
+    np.testing.assert_array_equal(heard.claimed["ego"], FRAMES[index].true["ego"])
 
 
 def test_a_replayed_pose_of_an_agent_that_came_late_is_its_first() -> None:
-    moments = [moment.without("car2") if i < 12 else moment for i, moment in enumerate(MOMENTS)]
-    assert ReplayedPose(seconds=1.0).apply(moments, 15, "ego", KEY).claimed["car2"][0, 3] == 12.0
+    frames = [frame.without("car2") if i < 12 else frame for i, frame in enumerate(FRAMES)]
+    assert ReplayedPose(seconds=1.0).apply(frames, 15, "ego", KEY).claimed["car2"][0, 3] == 12.0
 
 
 def test_an_offset_is_the_same_in_the_collaborators_own_frame() -> None:
     for index in (0, 9):
-        heard = OffsetPose(x=3.0, y=-2.0, yaw=10.0).apply(MOMENTS, index, "ego", KEY)
-        true = MOMENTS[index].true
+        heard = OffsetPose(x=3.0, y=-2.0, yaw=10.0).apply(FRAMES, index, "ego", KEY)
+        true = FRAMES[index].true
         for agent in ("car2", "car3"):
             true_SE2_claimed = SE2.from_matrix(np.linalg.inv(true[agent]) @ heard.claimed[agent])
             assert true_SE2_claimed.error_to(SE2(3.0, -2.0, math.radians(10.0))) == pytest.approx((0, 0), abs=1e-9)
@@ -92,17 +92,17 @@ def test_an_offset_is_the_same_in_the_collaborators_own_frame() -> None:
     "kind", [LocalisationNoise(), SamePlace(), ReplayedPose(), OffsetPose()], ids=lambda kind: type(kind).__name__
 )
 def test_only_claims_are_disturbed_and_they_stay_rigid(kind: LocalisationNoise) -> None:
-    heard = kind.apply(MOMENTS, 11, "ego", KEY)
-    assert heard.seen is MOMENTS[11].seen
-    assert heard.true is MOMENTS[11].true
-    assert any((heard.claimed[agent] != MOMENTS[11].claimed[agent]).any() for agent in heard.claimed)
+    heard = kind.apply(FRAMES, 11, "ego", KEY)
+    assert heard.observations is FRAMES[11].observations
+    assert heard.true is FRAMES[11].true
+    assert any((heard.claimed[agent] != FRAMES[11].claimed[agent]).any() for agent in heard.claimed)
     for claimed in heard.claimed.values():
         SE2.from_matrix(claimed)  # refuses what is no proper rigid transform
         assert claimed[2, 3] == pytest.approx(1.9, abs=0.1)  # the sensor leans
 
 
 def test_undisturbed_is_as_it_was() -> None:
-    assert Undisturbed().apply(MOMENTS, 2, "ego", KEY) is MOMENTS[2]
+    assert Undisturbed().apply(FRAMES, 2, "ego", KEY) is FRAMES[2]
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,14 @@ from cobevglue.messages import ObjectMessage, decode, encode
 
 from .drives import KEY, drive
 
-MOMENTS = drive()
+FRAMES = drive()
 
 
 def test_fabricated_boxes_are_added_behind_the_true_ones() -> None:
-    heard = FabricatedBoxes(count=6, reach=30.0).apply(MOMENTS, 3, "ego", KEY)
-    assert heard.seen["ego"] is MOMENTS[3].seen["ego"]
+    heard = FabricatedBoxes(count=6, reach=30.0).apply(FRAMES, 3, "ego", KEY)
+    assert heard.observations["ego"] is FRAMES[3].observations["ego"]
     for agent in ("car2", "car3"):
-        view, before = heard.seen[agent], MOMENTS[3].seen[agent]
+        view, before = heard.observations[agent], FRAMES[3].observations[agent]
         assert (view.boxes.center[:2] == before.boxes.center).all()
         assert len(view.boxes) == len(view.variance) == len(view.detections) == 8
         assert np.hypot(*view.boxes.center[2:, :2].T).max() <= 30.0
@@ -29,7 +29,7 @@ def test_fabricated_boxes_are_added_behind_the_true_ones() -> None:
 
 def test_fabricated_boxes_stay_with_their_collaborator_and_keep_their_ids() -> None:
     attack = FabricatedBoxes(count=4)
-    first, later = (attack.apply(MOMENTS, index, "ego", KEY).seen for index in (0, 9))
+    first, later = (attack.apply(FRAMES, index, "ego", KEY).observations for index in (0, 9))
     np.testing.assert_array_equal(first["car2"].boxes.center[2:], later["car2"].boxes.center[2:])
     assert first["car2"].boxes.track_id is not None
     assert later["car2"].boxes.track_id is not None
@@ -38,7 +38,7 @@ def test_fabricated_boxes_stay_with_their_collaborator_and_keep_their_ids() -> N
 
 
 def test_fabricated_boxes_can_be_sent_and_are_sorted_among_the_detections() -> None:
-    view = FabricatedBoxes(count=3).apply(MOMENTS, 0, "ego", KEY).seen["car2"]
+    view = FabricatedBoxes(count=3).apply(FRAMES, 0, "ego", KEY).observations["car2"]
     assert view.detections.score is not None
     assert view.detections.score.tolist() == [0.9, 0.9, 0.9, 0.8, 0.4]
     received = decode(encode(ObjectMessage("car2", 0.0, 0, view.boxes))).boxes
@@ -48,38 +48,40 @@ def test_fabricated_boxes_can_be_sent_and_are_sorted_among_the_detections() -> N
 
 
 def test_who_sees_nothing_can_make_things_up_too() -> None:
-    blind = replace(MOMENTS[0].seen["car2"], boxes=Boxes.empty(), variance=np.zeros((0, 3)), detections=Boxes.empty())
-    moment = replace(MOMENTS[0], seen={**MOMENTS[0].seen, "car2": blind})
-    view = FabricatedBoxes(count=3).apply([moment], 0, "ego", KEY).seen["car2"]
+    blind = replace(
+        FRAMES[0].observations["car2"], boxes=Boxes.empty(), variance=np.zeros((0, 3)), detections=Boxes.empty()
+    )
+    frame = replace(FRAMES[0], observations={**FRAMES[0].observations, "car2": blind})
+    view = FabricatedBoxes(count=3).apply([frame], 0, "ego", KEY).observations["car2"]
     assert len(view.boxes) == len(view.variance) == len(view.detections) == 3
 
 
 @pytest.mark.parametrize(("probability", "there"), [(0.0, 600), (0.25, 450), (1.0, 0)])
 def test_loss_drops_whole_collaborators_this_often(probability: float, there: int) -> None:
-    moments = drive(300)
-    heard = [MessageLoss(probability=probability).apply(moments, index, "ego", KEY) for index in range(300)]
-    assert sum(len(moment.collaborators("ego")) for moment in heard) == pytest.approx(there, abs=40)
-    assert all("ego" in moment.seen for moment in heard)
-    assert all(moment.seen.keys() == moment.claimed.keys() == moment.true.keys() for moment in heard)
+    frames = drive(300)
+    heard = [MessageLoss(probability=probability).apply(frames, index, "ego", KEY) for index in range(300)]
+    assert sum(len(frame.collaborators("ego")) for frame in heard) == pytest.approx(there, abs=40)
+    assert all("ego" in frame.observations for frame in heard)
+    assert all(frame.observations.keys() == frame.claimed.keys() == frame.true.keys() for frame in heard)
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.0, 0), (0.1, 1), (0.25, 3), (0.3, 3)])
 def test_late_messages_tell_what_was_seen_and_from_where_then(seconds: float, frames: int) -> None:
-    heard, now, then = Delay(seconds=seconds).apply(MOMENTS, 8, "ego", KEY), MOMENTS[8], MOMENTS[8 - frames]
-    assert heard.seen["ego"] is now.seen["ego"]
-    assert heard.seen["car2"] is then.seen["car2"]
+    heard, now, then = Delay(seconds=seconds).apply(FRAMES, 8, "ego", KEY), FRAMES[8], FRAMES[8 - frames]
+    assert heard.observations["ego"] is now.observations["ego"]
+    assert heard.observations["car2"] is then.observations["car2"]
     assert heard.claimed["car2"] is then.claimed["car2"]
     assert heard.true["car2"] is then.true["car2"]
     assert heard.time == now.time
 
 
 def test_before_the_first_late_message_there_is_only_the_ego() -> None:
-    heard = Delay(seconds=0.3).apply(MOMENTS, 2, "ego", KEY)
-    assert list(heard.seen) == list(heard.claimed) == list(heard.true) == ["ego"]
+    heard = Delay(seconds=0.3).apply(FRAMES, 2, "ego", KEY)
+    assert list(heard.observations) == list(heard.claimed) == list(heard.true) == ["ego"]
 
 
 def test_a_collaborator_that_has_just_come_is_heard_late_and_one_that_left_is_not() -> None:
-    came = [moment.without("car3") if i < 5 else moment for i, moment in enumerate(MOMENTS)]
-    assert "car3" not in Delay(seconds=0.2).apply(came, 6, "ego", KEY).seen
-    assert "car3" in Delay(seconds=0.2).apply(came, 7, "ego", KEY).seen
-    assert "car2" not in Delay(seconds=0.2).apply(drive(second_leaves=6), 6, "ego", KEY).seen
+    came = [frame.without("car3") if i < 5 else frame for i, frame in enumerate(FRAMES)]
+    assert "car3" not in Delay(seconds=0.2).apply(came, 6, "ego", KEY).observations
+    assert "car3" in Delay(seconds=0.2).apply(came, 7, "ego", KEY).observations
+    assert "car2" not in Delay(seconds=0.2).apply(drive(second_leaves=6), 6, "ego", KEY).observations

@@ -69,11 +69,11 @@ def test_pose_errors_are_those_of_the_noise(settings: StudySettings) -> None:
     result = run(settings, [CLEAN, noisy])
     assert result.conditions[CLEAN.key].frames[1].heard[0].translation_error == pytest.approx(0.0, abs=1e-9)
     noise = LocalisationNoise(position=2.5, yaw=2.5)
-    from cobevglue.experiments.drive import Drive
+    from cobevglue.experiments.observed_sequence import ObservedSequence
 
-    drive = Drive(Models(settings).detector)
-    drive.see(open_drive(settings, 0))
-    claimed = noise.apply(drive.moments, 1, "1", (settings.seed, 0)).claimed
+    drive = ObservedSequence(Models(settings).detector)
+    drive.observe(open_drive(settings, 0))
+    claimed = noise.apply(drive.frames, 1, "1", (settings.seed, 0)).claimed
     believed = SE2.from_matrix(np.linalg.inv(claimed["1"]) @ claimed["2"])
     true = SE2.from_matrix(np.linalg.inv(world_SE3_lidar(1, 1)) @ world_SE3_lidar(2, 1))
     (heard,) = result.conditions[noisy.key].frames[1].heard
@@ -186,11 +186,11 @@ def test_a_message_is_made_once_for_a_view(settings: StudySettings) -> None:
             return super().message(seen)
 
     models = Models(settings)
-    from cobevglue.experiments.drive import Drive
+    from cobevglue.experiments.observed_sequence import ObservedSequence
 
-    drive = Drive(models.detector)
-    drive.see(open_drive(settings, 0))
-    first, second = (moment.seen["2"] for moment in drive.moments[:2])
+    drive = ObservedSequence(models.detector)
+    drive.observe(open_drive(settings, 0))
+    first, second = (frame.observations["2"] for frame in drive.frames[:2])
     method = Counting(models.detector)
     memo = MessageMemo(method)
     assert memo.kind == "boxes"

@@ -135,7 +135,7 @@ def test_the_teacher_learns_from_the_merged_cloud_alone() -> None:
     teacher = EarlyTeacher(DETECTOR)
     sample = make_sample()
     with torch.no_grad():
-        blind = replace(sample, seen=[checks.view(DETECTOR, 7), checks.view(DETECTOR, 8)])
+        blind = replace(sample, observations=[checks.view(DETECTOR, 7), checks.view(DETECTOR, 8)])
         assert torch.equal(teacher([sample]).logits, teacher([blind]).logits)
     terms = teacher.loss([sample], make_targets(1), DetectionLoss(checks.SMALL))
     terms["total"].backward()  # type: ignore[no-untyped-call]

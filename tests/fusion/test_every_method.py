@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cobevglue.fusion import FUSION_METHODS, IntermediateFusion
-from cobevglue.fusion.turn import Turn
+from cobevglue.fusion.rotation_conditioning import RotationConditioning
 from cobevglue.fusion.where2comm import Where2comm
 from cobevglue.perception import DetectionLoss, assign_targets, collate_targets
 
@@ -93,4 +93,4 @@ def test_saved_weights_say_the_same(name: str, tmp_path: Path) -> None:
 @every_method
 def test_before_training_features_are_not_turned(name: str) -> None:
     method = checks.seeded(LEARNED[name], DETECTOR)
-    assert all(isinstance(turn, Turn) and not turn.last.weight.any() for turn in method.turns)
+    assert all(isinstance(turn, RotationConditioning) and not turn.last.weight.any() for turn in method.conditioning)

@@ -1,4 +1,4 @@
-"""FPV-RCNN: keypoints lie in proposals, proposals of one object become one, and the second look makes boxes better."""
+"""FPV-RCNN: keypoints lie in proposals, proposals of one object become one, and the second stage refines boxes."""
 
 from __future__ import annotations
 

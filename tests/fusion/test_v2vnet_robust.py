@@ -82,7 +82,7 @@ def wide_detector() -> PointPillars:
         torch.manual_seed(0)
         detector = PointPillars(WIDE).eval()
     quick_norms(detector)
-    clouds = [torch.from_numpy(view.points) for view in make_scene(detector, 99).seen]
+    clouds = [torch.from_numpy(view.points) for view in make_scene(detector, 99).observations]
     detector.train()
     with torch.no_grad():
         for _ in range(6):
@@ -207,7 +207,7 @@ def test_claimed_poses_are_brought_nearer(learnt: tuple[V2VNetRobust, V2VNetRobu
     for sample in samples:
         observations = {
             str(i): Observation(features=view.features, pose=world_SE3(pose))
-            for i, (view, pose) in enumerate(zip(sample.seen, sample.ego_SE2_agent, strict=True))
+            for i, (view, pose) in enumerate(zip(sample.observations, sample.ego_SE2_agent, strict=True))
         }
         found = aligner.align_group("0", observations)["1"].ego_SE2_other
         assert found is not None

@@ -29,7 +29,7 @@ def test_what_comes_out_belongs_together(trained: PointPillars) -> None:
     out = Perception(trained).step(cloud_of(OBJECTS))
     assert [tuple(f.shape) for f in out.features] == [(12, 24, 32), (16, 12, 16), (24, 6, 8)]
     assert out.variance.shape == (len(out.boxes), 3)
-    assert list(out.seconds) == ["pillars", "backbone", "head", "boxes", "facing", "tracking"]
+    assert list(out.seconds) == ["pillars", "backbone", "head", "boxes", "heading", "tracking"]
     assert out.boxes.score is not None
     assert out.detections.score is not None
     assert out.detections.track_id is None

@@ -43,7 +43,7 @@ def test_they_are_of_the_configuration_they_are_called_by(name: str, detector: P
 
 def test_they_say_how_they_came_about(detector: PointPillars) -> None:
     *stages, last = detector.metadata["stages"]
-    assert "train facing" in last["command"]
+    assert "train heading" in last["command"]
     assert all("train detector" in stage["command"] for stage in stages)
     for stage in (*stages, last):
         assert stage["commit"]

@@ -63,9 +63,9 @@ def test_frames_come_back_as_the_detector_saw_them(detector_file: Path, features
     detector = PointPillars.load(detector_file)
     frames = FusionFrames(features / "train")
     assert len(frames) == 4
-    assert [len(frames[i].seen) for i in range(4)] == [2, 2, 3, 3]
+    assert [len(frames[i].observations) for i in range(4)] == [2, 2, 3, 3]
     frame = frames[2]
-    for view in frame.seen:
+    for view in frame.observations:
         with torch.inference_mode():
             maps = detector.multiscale(detector.encode([torch.from_numpy(view.points)]))
         for stored, computed in zip(view.features, maps, strict=True):
@@ -78,7 +78,7 @@ def test_frames_come_back_as_the_detector_saw_them(detector_file: Path, features
 def test_any_agent_can_be_the_ego(features: Path) -> None:
     frame = FusionFrames(features / "train")[2]
     turned = frame.with_ego(1)
-    assert [id(view) for view in turned.seen] == [id(frame.seen[i]) for i in (1, 0, 2)]
+    assert [id(view) for view in turned.observations] == [id(frame.observations[i]) for i in (1, 0, 2)]
     before, after = (
         one.truth.center @ one.world_SE3_agent[0][:3, :3].T + one.world_SE3_agent[0][:3, 3] for one in (frame, turned)
     )

@@ -19,7 +19,7 @@ class Stage(str, Enum):
     """What can be trained."""
 
     DETECTOR = "detector"
-    FACING = "facing"
+    HEADING = "heading"
     FUSION = "fusion"
 
 
@@ -48,11 +48,11 @@ def train(
         from cobevglue.training import (
             DivergedError,
             load_config,
-            load_facing_config,
             load_fusion_config,
+            load_heading_config,
             train_detector,
-            train_facing,
             train_fusion,
+            train_heading,
         )
     except ImportError as error:
         raise InputError(" ".join(str(error).split())) from error
@@ -64,8 +64,8 @@ def train(
                 result = train_detector(settings, folder, resume=resume, max_minutes=max_minutes)
             elif max_minutes is not None:
                 raise ValueError("--max-minutes: is for the detector; all else takes minutes")
-            elif stage is Stage.FACING:
-                result = train_facing(load_facing_config(config, changes or ()), folder, resume=resume)
+            elif stage is Stage.HEADING:
+                result = train_heading(load_heading_config(config, changes or ()), folder, resume=resume)
             else:
                 result = train_fusion(load_fusion_config(config, changes or ()), folder, resume=resume)
     except DivergedError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from cobevglue.datasets.frame import did_you_mean
-from cobevglue.disturbance.disturbance import Disturbance, Moment, Undisturbed
+from cobevglue.disturbance.disturbance import Disturbance, ObservedFrame, Undisturbed
 from cobevglue.disturbance.localisation import LocalisationNoise, OffsetPose, ReplayedPose, SamePlace
 from cobevglue.disturbance.messages import Delay, FabricatedBoxes, MessageLoss
 
@@ -16,7 +16,7 @@ __all__ = [
     "FabricatedBoxes",
     "LocalisationNoise",
     "MessageLoss",
-    "Moment",
+    "ObservedFrame",
     "OffsetPose",
     "ReplayedPose",
     "SamePlace",

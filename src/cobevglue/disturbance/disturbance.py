@@ -1,4 +1,4 @@
-"""What every disturbance looks like from outside: it changes what an ego hears in one moment of a drive."""
+"""What every disturbance looks like from outside: it changes what an ego hears in one frame of a drive."""
 
 from __future__ import annotations
 
@@ -16,66 +16,66 @@ from cobevglue.typing import FloatArray
 if TYPE_CHECKING:
     from cobevglue.perception import PerceptionOutput
 
-__all__ = ["Disturbance", "Moment", "Undisturbed", "agent_rng"]
+__all__ = ["Disturbance", "ObservedFrame", "Undisturbed", "agent_rng"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
-    """What all agents tell at one time; three tables by the agents' names.
+class ObservedFrame:
+    """Observations and poses of all agents in one frame; three mappings from the agents' names.
 
     Attributes:
-        time: when it is told [s].
-        seen: what each agent saw.
-        claimed: (4, 4) world_SE3_lidar as each agent's localisation has it.
-        true: (4, 4) world_SE3_lidar of each agent when it saw this; nobody but the evaluation looks at it.
+        time: when the messages are sent [s].
+        observations: the output of each agent's perception.
+        claimed: (4, 4) world_SE3_lidar from each agent's localisation.
+        true: (4, 4) world_SE3_lidar of each agent at the time of its observation; for the evaluation only.
     """
 
     time: float
-    seen: Mapping[str, PerceptionOutput]
+    observations: Mapping[str, PerceptionOutput]
     claimed: Mapping[str, FloatArray]
     true: Mapping[str, FloatArray]
 
-    def without(self, agent: str) -> Moment:
-        """The same, but nothing of this agent."""
+    def without(self, agent: str) -> ObservedFrame:
+        """The frame without this agent."""
         return replace(
             self,
-            seen=_without(self.seen, agent),
+            observations=_without(self.observations, agent),
             claimed=_without(self.claimed, agent),
             true=_without(self.true, agent),
         )
 
     def collaborators(self, ego: str) -> list[str]:
         """All agents but the ego."""
-        return [agent for agent in self.seen if agent != ego]
+        return [agent for agent in self.observations if agent != ego]
 
 
 class Disturbance(Settings):
-    """Something that goes wrong between the agents. The same key gives the same disturbance, in any process."""
+    """A disturbance of localisation or communication. The same key gives the same disturbance in any process."""
 
     @abstractmethod
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
-        """What is heard in place of `moments[index]`.
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
+        """What the ego receives in place of `frames[index]`.
 
         Args:
-            moments: a drive from its beginning, undisturbed. Of moments that are more than a second old only the poses
-                may be there.
-            index: which one is heard.
-            ego: who hears it. What the ego saw itself is never changed.
-            key: whole numbers >= 0, such as the seed and the number of the drive; random numbers come from
+            frames: the undisturbed sequence from its beginning. Observations older than one second may be missing;
+                poses are complete.
+            index: the current frame.
+            ego: name of the receiver. Its own observations are never changed.
+            key: whole numbers >= 0, such as the seed and the number of the sequence; random numbers come from
                 `np.random.default_rng([*key, stream, index, agent])`.
         """
 
 
 class Undisturbed(Disturbance):
-    """Everything as it is."""
+    """No disturbance."""
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
-        """The moment itself."""
-        return moments[index]
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
+        """The frame itself."""
+        return frames[index]
 
 
 def agent_rng(key: Sequence[int], stream: int, index: int, agent: str) -> np.random.Generator:
-    """Random numbers of one agent in one moment, whichever others are there."""
+    """Random numbers of one agent in one frame, whichever others are there."""
     return np.random.default_rng([*key, stream, index, zlib.crc32(agent.encode())])
 
 

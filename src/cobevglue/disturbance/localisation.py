@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from cobevglue.disturbance.disturbance import Disturbance, Moment, agent_rng
+from cobevglue.disturbance.disturbance import Disturbance, ObservedFrame, agent_rng
 from cobevglue.typing import FloatArray
 
 __all__ = ["LocalisationNoise", "OffsetPose", "ReplayedPose", "SamePlace"]
@@ -21,7 +21,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class LocalisationNoise(Disturbance):
-    """Gaussian noise on the pose of every agent, the ego's included, anew in every moment (paper, section 6.2).
+    """Gaussian noise on the pose of every agent, the ego's included, anew in every frame (paper, section 6.2).
 
     The same key gives the same noise at every level, but for its size: levels can be compared draw by draw.
 
@@ -33,9 +33,9 @@ class LocalisationNoise(Disturbance):
     position: _Spread = 0.5
     yaw: _Spread = 0.5
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Everyone claims a pose next to its own."""
-        now = moments[index]
+        now = frames[index]
         claimed = {}
         for agent, world_SE3_lidar in now.claimed.items():
             x, y, turn = agent_rng(key, _NOISE_STREAM, index, agent).standard_normal(3)
@@ -48,9 +48,9 @@ class LocalisationNoise(Disturbance):
 class SamePlace(Disturbance):
     """The attack of the paper: spoofed satellites make all collaborators believe they are where the ego is."""
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Everyone claims the ego's pose."""
-        now = moments[index]
+        now = frames[index]
         return replace(now, claimed=dict.fromkeys(now.claimed, now.claimed[ego]))
 
 
@@ -58,18 +58,18 @@ class ReplayedPose(Disturbance):
     """Spoofed satellites play back an old recording: collaborators claim the pose of some time ago.
 
     Attributes:
-        seconds: how old it is [s]; in the first moments of a drive, the first pose there is.
+        seconds: how old it is [s]; in the first frames of a drive, the first pose there is.
     """
 
     seconds: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 1.0
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Collaborators claim their old pose."""
-        now = moments[index]
+        now = frames[index]
         claimed = dict(now.claimed)
         for agent in now.collaborators(ego):
-            had = [moment for moment in moments[: index + 1] if agent in moment.claimed]
-            old = [moment for moment in had if moment.time <= now.time - self.seconds + 1e-6]
+            had = [frame for frame in frames[: index + 1] if agent in frame.claimed]
+            old = [frame for frame in had if frame.time <= now.time - self.seconds + 1e-6]
             claimed[agent] = (old[-1] if old else had[0]).claimed[agent]
         return replace(now, claimed=claimed)
 
@@ -87,9 +87,9 @@ class OffsetPose(Disturbance):
     y: _Finite = -2.0
     yaw: _Finite = 3.0
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Collaborators claim a pose beside their own."""
-        now = moments[index]
+        now = frames[index]
         lidar_SE3_believed = _turned(math.radians(self.yaw))
         lidar_SE3_believed[:2, 3] = self.x, self.y
         claimed = {agent: pose if agent == ego else pose @ lidar_SE3_believed for agent, pose in now.claimed.items()}

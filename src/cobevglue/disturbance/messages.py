@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from cobevglue.boxes import Boxes
-from cobevglue.disturbance.disturbance import Disturbance, Moment, agent_rng
+from cobevglue.disturbance.disturbance import Disturbance, ObservedFrame, agent_rng
 from cobevglue.messages import MAX_TRACK_ID
 
 if TYPE_CHECKING:
@@ -42,13 +42,13 @@ class FabricatedBoxes(Disturbance):
     count: Annotated[int, Field(ge=0, le=1000)] = 10
     reach: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 40.0
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Collaborators tell more than they saw."""
-        now = moments[index]
-        seen = dict(now.seen)
+        now = frames[index]
+        seen = dict(now.observations)
         for agent in now.collaborators(ego):
             seen[agent] = self._with_more(seen[agent], agent_rng(key, _FABRICATED_STREAM, 0, agent))
-        return replace(now, seen=seen)
+        return replace(now, observations=seen)
 
     def _with_more(self, view: PerceptionOutput, rng: np.random.Generator) -> PerceptionOutput:
         distance, bearing = self.reach * np.sqrt(rng.random(self.count)), rng.uniform(-math.pi, math.pi, self.count)
@@ -76,14 +76,14 @@ class MessageLoss(Disturbance):
     """Now and then nothing of a collaborator arrives.
 
     Attributes:
-        probability: that this happens to one collaborator in one moment.
+        probability: that this happens to one collaborator in one frame.
     """
 
     probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Some collaborators are missing."""
-        now = moments[index]
+        now = frames[index]
         for agent in now.collaborators(ego):
             if agent_rng(key, _LOSS_STREAM, index, agent).random() < self.probability:
                 now = now.without(agent)
@@ -101,15 +101,19 @@ class Delay(Disturbance):
 
     seconds: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
 
-    def apply(self, moments: Sequence[Moment], index: int, ego: str, key: Sequence[int]) -> Moment:
+    def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
         """Collaborators as they were."""
-        now = moments[index]
-        sent = [moment for moment in moments[: index + 1] if moment.time <= now.time - self.seconds + 1e-6]
+        now = frames[index]
+        sent = [frame for frame in frames[: index + 1] if frame.time <= now.time - self.seconds + 1e-6]
         then = sent[-1] if sent else None
-        seen, claimed, true = dict(now.seen), dict(now.claimed), dict(now.true)
+        seen, claimed, true = dict(now.observations), dict(now.claimed), dict(now.true)
         for agent in now.collaborators(ego):
-            if then is None or agent not in then.seen:
+            if then is None or agent not in then.observations:
                 del seen[agent], claimed[agent], true[agent]
             else:
-                seen[agent], claimed[agent], true[agent] = then.seen[agent], then.claimed[agent], then.true[agent]
-        return replace(now, seen=seen, claimed=claimed, true=true)
+                seen[agent], claimed[agent], true[agent] = (
+                    then.observations[agent],
+                    then.claimed[agent],
+                    then.true[agent],
+                )
+        return replace(now, observations=seen, claimed=claimed, true=true)

@@ -10,12 +10,12 @@ import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.poses import inverse_SE3
-from cobevglue.disturbance import Moment
+from cobevglue.disturbance import ObservedFrame
 from cobevglue.evaluation.detection_matching import inside
 from cobevglue.experiments.condition import Condition
-from cobevglue.experiments.drive import Drive
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
+from cobevglue.experiments.observed_sequence import ObservedSequence
 from cobevglue.experiments.study import StudySettings, drive_frames, drive_names, open_drive
 from cobevglue.experiments.tables.noise import noise_curves
 from cobevglue.experiments.tables.registration import registration_points
@@ -69,7 +69,7 @@ def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> lis
     drive = _drive_in_company(settings, models)
     if drive is None:
         return []
-    ego, moment, truth = drive.ego, drive.moments[-1], drive.truth[-1]
+    ego, frame, truth = drive.ego, drive.frames[-1], drive.truth[-1]
     counted = inside(truth.objects, models.evaluation_range) & (truth.point_count >= settings.min_points)
     objects = truth.objects[counted]
     (ours,) = scope.localised
@@ -79,64 +79,68 @@ def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> lis
             out = _run(as_is(name, _NOISE), drive, models, settings.seed)
             title = f"{method_title(name)}, noise {_NOISE:g} m, {_NOISE:g}°"
             caption = f"{title}: true boxes in green, detections of score {_SCORE:g} and more in red."
-            clouds = _clouds(moment, ego, _true_poses(moment, ego))
+            clouds = _clouds(frame, ego, _true_poses(frame, ego))
             pictures.append((caption, detections_picture(clouds, objects, _sure(out.boxes), title)))
     for aligner in scope.registrations:
         if not needs(aligner, "pose"):
             condition = as_is(ours, 0.0, aligner, aligner_options={"budget_bytes": scope.budgets[-1]})
             out = _run(condition, drive, models, settings.seed, last_only=True)
             title = f"{aligner_title(aligner)} on {scope.budgets[-1]:,} bytes of points"
-            caption = f"{title}: all clouds where it puts them, true boxes in green. {_errors(moment, ego, out)}."
-            clouds = _clouds(moment, ego, {name: one.ego_SE2_other for name, one in out.alignments.items()})
+            caption = f"{title}: all clouds where it puts them, true boxes in green. {_errors(frame, ego, out)}."
+            clouds = _clouds(frame, ego, {name: one.ego_SE2_other for name, one in out.alignments.items()})
             pictures.append((caption, detections_picture(clouds, objects, Boxes.empty(), title)))
     out = _run(as_is(ours), drive, models, settings.seed)
     for other, alignment in out.alignments.items():
         sent = out.alignment_bytes[other]
-        caption = f"BEVGlue on {sent:,} bytes of boxes, those that match joined. {_errors(moment, ego, out, other)}."
-        pictures.append((caption, matching_picture(moment.seen[ego].boxes, moment.seen[other].boxes, alignment)))
+        caption = f"BEVGlue on {sent:,} bytes of boxes, those that match joined. {_errors(frame, ego, out, other)}."
+        pictures.append(
+            (caption, matching_picture(frame.observations[ego].boxes, frame.observations[other].boxes, alignment))
+        )
     return pictures
 
 
-def _drive_in_company(settings: StudySettings, models: Models) -> Drive | None:
+def _drive_in_company(settings: StudySettings, models: Models) -> ObservedSequence | None:
     """The first drive at whose last shown frame there are others, gone through up to there."""
     for number in range(len(drive_names(settings))):
-        drive = Drive(models.detector)
-        drive.see(islice(drive_frames(settings, open_drive(settings, number)), _FRAMES))
-        if drive.moments and drive.moments[-1].collaborators(drive.ego):
+        drive = ObservedSequence(models.detector)
+        drive.observe(islice(drive_frames(settings, open_drive(settings, number)), _FRAMES))
+        if drive.frames and drive.frames[-1].collaborators(drive.ego):
             return drive
     return None
 
 
-def _run(condition: Condition, drive: Drive, models: Models, seed: int, last_only: bool = False) -> StepOutput:
+def _run(
+    condition: Condition, drive: ObservedSequence, models: Models, seed: int, last_only: bool = False
+) -> StepOutput:
     """What the ego concludes in the last frame; who remembers has seen those before."""
     system = CoBEVGlue(models.detector, models.method(condition.fusion), models.aligner(condition))
     disturbance = condition.make_disturbance()
-    last = len(drive.moments) - 1
+    last = len(drive.frames) - 1
     for index in range(last if last_only else 0, last + 1):
-        moment = disturbance.apply(drive.moments, index, drive.ego, (seed, 0))
-        out = system.collaborate(moment.seen, drive.ego, moment.time, moment.claimed)
+        frame = disturbance.apply(drive.frames, index, drive.ego, (seed, 0))
+        out = system.collaborate(frame.observations, drive.ego, frame.time, frame.claimed)
     return out
 
 
-def _true_poses(moment: Moment, ego: str) -> dict[str, SE2]:
+def _true_poses(frame: ObservedFrame, ego: str) -> dict[str, SE2]:
     """Of all collaborators in the ego's frame."""
-    ego_SE3_world = inverse_SE3(moment.true[ego])
-    return {other: SE2.from_matrix(ego_SE3_world @ moment.true[other]) for other in moment.collaborators(ego)}
+    ego_SE3_world = inverse_SE3(frame.true[ego])
+    return {other: SE2.from_matrix(ego_SE3_world @ frame.true[other]) for other in frame.collaborators(ego)}
 
 
-def _clouds(moment: Moment, ego: str, poses: Mapping[str, SE2 | None]) -> list[FloatArray]:
+def _clouds(frame: ObservedFrame, ego: str, poses: Mapping[str, SE2 | None]) -> list[FloatArray]:
     """The ego's points, and those of the others by these poses; without a pose they are left out."""
-    clouds = [moment.seen[ego].points[:, :3].astype(np.float64)]
+    clouds = [frame.observations[ego].points[:, :3].astype(np.float64)]
     for other, ego_SE2_other in poses.items():
         if ego_SE2_other is not None:
-            clouds.append(ego_SE2_other.apply(moment.seen[other].points[:, :3]))
+            clouds.append(ego_SE2_other.apply(frame.observations[other].points[:, :3]))
     return clouds
 
 
-def _errors(moment: Moment, ego: str, out: StepOutput, only: str = "") -> str:
+def _errors(frame: ObservedFrame, ego: str, out: StepOutput, only: str = "") -> str:
     """How far off the poses are."""
     parts = []
-    for other, truth in _true_poses(moment, ego).items():
+    for other, truth in _true_poses(frame, ego).items():
         if only in ("", other):
             pose = out.alignments[other].ego_SE2_other
             if pose is None:

@@ -11,11 +11,11 @@ import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.frame import Scenario
-from cobevglue.disturbance import Disturbance, Moment
+from cobevglue.disturbance import Disturbance, ObservedFrame
 from cobevglue.evaluation.alignment import landing_error
 from cobevglue.experiments.condition import Condition
-from cobevglue.experiments.drive import Drive
 from cobevglue.experiments.models import Models
+from cobevglue.experiments.observed_sequence import ObservedSequence
 from cobevglue.experiments.results import ConditionResult, FrameResult, Heard, ScenarioResult
 from cobevglue.experiments.study import StudySettings, drive_frames
 from cobevglue.fusion import FusionMethod, Received
@@ -55,13 +55,13 @@ def run_drive(
     Raises:
         ValueError: a broken file; names it.
     """
-    seeing = Drive(models.detector)
+    sequence = ObservedSequence(models.detector)
     memos = {condition.fusion: MessageMemo(models.method(condition.fusion)) for condition in conditions}
     runs = [_Run(condition, models, memos[condition.fusion], (settings.seed, number)) for condition in conditions]
     runs.sort(key=lambda run: list(memos).index(run.condition.fusion))  # so that only one memo is full at a time
     frames = iter(drive_frames(settings, drive))
     while block := list(islice(frames, _BLOCK)):
-        new = seeing.see(block)
+        new = sequence.observe(block)
         progress(PERCEPTION_COST * len(block))
         fusion = ""
         for run in runs:
@@ -70,16 +70,16 @@ def run_drive(
                 for memo in memos.values():
                     memo.clear()
             for index in new:
-                run.step(seeing, index)
+                run.step(sequence, index)
             progress(len(block) / run.condition.every)
         for memo in memos.values():
             memo.clear()
-        seeing.forget_views(before=new.start)
+        sequence.drop_observations(before=new.start)
     return ScenarioResult(
         drive.name,
-        seeing.ego,
-        seeing.truth,
-        dict(seeing.left_out),
+        sequence.ego,
+        sequence.truth,
+        dict(sequence.left_out),
         {
             run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition), run.frames)
             for run in runs
@@ -98,27 +98,27 @@ class _Run:
         self._disturbance: Disturbance = condition.make_disturbance()
         self._key = key
 
-    def step(self, drive: Drive, index: int) -> None:
+    def step(self, drive: ObservedSequence, index: int) -> None:
         """The next frame."""
         if index % self.condition.every:
             return
-        moment = self._disturbance.apply(drive.moments, index, drive.ego, self._key)
+        frame = self._disturbance.apply(drive.frames, index, drive.ego, self._key)
         if self.condition.forget:
             self._system.aligner.reset()
-        poses = moment.true if self.condition.true_poses else moment.claimed
+        poses = frame.true if self.condition.true_poses else frame.claimed
         self._memo.saved = 0.0
-        out = self._system.collaborate(moment.seen, drive.ego, moment.time, poses)
+        out = self._system.collaborate(frame.observations, drive.ego, frame.time, poses)
         out.seconds["messages"] += self._memo.saved
-        self.frames[index] = FrameResult(_numbers(out.boxes), tuple(_heard(moment, drive.ego, out)), out.seconds)
+        self.frames[index] = FrameResult(_numbers(out.boxes), tuple(_heard(frame, drive.ego, out)), out.seconds)
 
 
-def _heard(moment: Moment, ego: str, out: StepOutput) -> Iterator[Heard]:
+def _heard(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator[Heard]:
     for agent, alignment in out.alignments.items():
         translation = yaw = landing = math.inf
         if alignment.ego_SE2_other is not None:
-            truth = SE2.from_matrix(np.linalg.inv(moment.true[ego]) @ moment.true[agent])
+            truth = SE2.from_matrix(np.linalg.inv(frame.true[ego]) @ frame.true[agent])
             translation, yaw = alignment.ego_SE2_other.error_to(truth)
-            landing = landing_error(alignment.ego_SE2_other, truth, moment.seen[agent].boxes)
+            landing = landing_error(alignment.ego_SE2_other, truth, frame.observations[agent].boxes)
         yield Heard(
             agent, translation, yaw, landing, alignment.reason, out.message_bytes[agent], out.alignment_bytes[agent]
         )

@@ -34,7 +34,7 @@ class CoarseMapFusion(IntermediateFusion):
         self.up = nn.ConvTranspose2d(self.channels, narrow, 2, 2, bias=False)
         nn.init.normal_(self.up.weight, std=0.001)
 
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """Of the map at stride 4."""
         return [2 * self.config.shrink_channels]
 

@@ -23,7 +23,7 @@ class EarlyTeacher(MultiScaleFusion):
 
     learns_from_merged_clouds = True
 
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """None: all points are in the ego's frame."""
         return []
 
@@ -118,7 +118,7 @@ class DiscoNet(SingleMapFusion):
 def merged_features(sample: FusionSample) -> tuple[Tensor, Tensor, Tensor] | None:
     """The encoder's maps of the points of all agents together, where they are known."""
     # One agent's points are all there are.
-    return sample.seen[0].features if len(sample.seen) == 1 else sample.early_features
+    return sample.observations[0].features if len(sample.observations) == 1 else sample.early_features
 
 
 def distillation_loss(student: Tensor, teacher: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """FPV-RCNN (Yuan et al., RA-L 2022): agents share what they detected and features of some points on it.
 
-With these, each takes a second look at everything that anyone detected. The paper is "Keypoints-Based Deep Feature
+With these, the ego refines the proposals of all agents in a second stage. The paper is "Keypoints-Based Deep Feature
 Fusion for Cooperative Vehicle Detection of Autonomous Driving".
 
 On this project's encoder: the paper's is sparse convolutions with a head of their own, and a keypoint's features there
@@ -84,7 +84,7 @@ class FPVRCNN(SingleMapFusion):
         self.describe = nn.Linear(self.config.shrink_channels, _FEATURES)
         self.second_stage = RoIHead(_FEATURES, _MARGIN)
 
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """None: no maps are shared, and the second stage turns what keypoints say."""
         return []
 
@@ -105,9 +105,9 @@ class FPVRCNN(SingleMapFusion):
 
     @torch.inference_mode()
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
-        """The merged proposals after the second look, best first."""
+        """The merged proposals after the second stage, best first."""
         told = [self._look(ego), *(self._read(other) for other in received)]
-        proposals, _, logits, refinement = self._second_look(told)
+        proposals, _, logits, refinement = self._second_stage(told)
         boxes = decode_refinement(refinement.double().cpu().numpy(), proposals)
         boxes = boxes.replace(score=logits.sigmoid().double().cpu().numpy(), label=np.full(len(boxes), LABEL))
         assert boxes.score is not None
@@ -124,10 +124,10 @@ class FPVRCNN(SingleMapFusion):
         Raises:
             ValueError: a sample comes without its truth.
         """
-        agents = [seen for sample in samples for seen in sample.seen]
+        agents = [seen for sample in samples for seen in sample.observations]
         maps = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
         output = self.decode_maps(maps)
-        first = np.cumsum([0, *(len(sample.seen) for sample in samples[:-1])]).tolist()
+        first = np.cumsum([0, *(len(sample.observations) for sample in samples[:-1])]).tolist()
         terms = loss(HeadOutput(*(values[first] for values in output)), targets)._asdict()
 
         told = self._told(maps[0], output, agents)
@@ -170,7 +170,7 @@ class FPVRCNN(SingleMapFusion):
         features = torch.from_numpy(received.content["features"].astype(np.float32)).to(self.describe.weight)
         return _Told(proposals, received.content["keypoints"], features).seen_from(received.ego_SE2_other)
 
-    def _second_look(self, told: Sequence[_Told]) -> tuple[Boxes, IntArray, Tensor, Tensor]:
+    def _second_stage(self, told: Sequence[_Told]) -> tuple[Boxes, IntArray, Tensor, Tensor]:
         """The R merged proposals, how many each is made of, logits (R,) and refinements (R, 7)."""
         proposals, count = merge_proposals(Boxes.concatenate([t.proposals for t in told]), _SAME_OBJECT)
         features = torch.cat([t.features for t in told])
@@ -182,7 +182,7 @@ class FPVRCNN(SingleMapFusion):
 
     def _second_loss(self, told: Sequence[_Told], truth: Boxes, loss: DetectionLoss) -> tuple[Tensor, ...]:
         """Sums over the proposals of one sample: of both terms, of proposals, and of those that overlap an object."""
-        proposals, _, logits, refinement = self._second_look(told)
+        proposals, _, logits, refinement = self._second_stage(told)
         truth = truth[truth.size[:, 2] > 0.0].replace(track_id=None)  # an unknown height cannot be learned
         if not len(proposals) or not len(truth):
             zero = logits.new_zeros(())

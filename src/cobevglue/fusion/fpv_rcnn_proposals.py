@@ -14,7 +14,7 @@ from cobevglue.typing import FloatArray, IntArray
 __all__ = ["decode_refinement", "encode_refinement", "merge_proposals"]
 
 _LARGEST = 1.0
-"""Refinements of size are cut here: a second look makes no box more than e times larger."""
+"""Refinements of size are cut here: the second stage makes no box more than e times larger."""
 
 
 def merge_proposals(boxes: Boxes, min_iou: float) -> tuple[Boxes, IntArray]:

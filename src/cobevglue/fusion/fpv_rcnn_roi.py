@@ -13,7 +13,7 @@ _CHANNELS = 32
 _HIDDEN = 128
 _SCORE_LIMIT = 1e-4
 _HARMONICS = 2
-"""Sines and cosines of an angle, and of twice the angle, as in `Turn`."""
+"""Sines and cosines of an angle, and of twice the angle, as in `RotationConditioning`."""
 
 
 class RoIHead(nn.Module):
@@ -24,7 +24,8 @@ class RoIHead(nn.Module):
     so that a keypoint is looked at many times; here it counts for its own cell, which is what a CPU has time for.
 
     Features say directions in the frame of the agent that they are from, and a proposal is looked at in its own axes:
-    so the weights of the features are trigonometric polynomials of the angle between the two (ours, see `Turn`).
+    so the weights of the features are trigonometric polynomials of the angle between the two (ours, see
+    `RotationConditioning`).
 
     Scores are told relative to those of the proposals, so that before training they are the same.
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from cobevglue.boxes import Boxes
 from cobevglue.fusion.method import FusionMethod, Received
-from cobevglue.fusion.turn import Turn
+from cobevglue.fusion.rotation_conditioning import RotationConditioning
 from cobevglue.fusion.warp import coverage, warp
 from cobevglue.messages import Arrays
 from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
@@ -45,7 +45,7 @@ class FusionSample:
     """What a method is trained on: one frame of some agents, the ego first.
 
     Attributes:
-        seen: what each of the n agents saw, each in its own LiDAR frame.
+        observations: what each of the n agents saw, each in its own LiDAR frame.
         ego_SE2_agent: n poses in the ego's frame, as the ego believes them; the first is the identity.
         true_ego_SE2_agent: the same, true.
         early_features: the three maps of the encoder for the merged cloud of all agents (by the true poses), for
@@ -53,7 +53,7 @@ class FusionSample:
         truth: the objects to find, in the ego's LiDAR frame.
     """
 
-    seen: Sequence[PerceptionOutput]
+    observations: Sequence[PerceptionOutput]
     ego_SE2_agent: Sequence[SE2]
     true_ego_SE2_agent: Sequence[SE2]
     early_features: tuple[Tensor, Tensor, Tensor] | None = None
@@ -84,12 +84,12 @@ class IntermediateFusion(FusionMethod, nn.Module):
         self.anchors = detector.anchors
         self.neck = copy.deepcopy(detector.neck)
         self.head = copy.deepcopy(detector.head)
-        self.turns = nn.ModuleList(Turn(channels) for channels in self.turned_channels())
+        self.conditioning = nn.ModuleList(RotationConditioning(channels) for channels in self.conditioned_channels())
         self.metadata: dict[str, Any] = {}
         self.encoder = fingerprint(nn.ModuleList([detector.pillars, detector.backbone]))
 
     @abstractmethod
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """Channels of the shared maps that say something of directions, the first ones of `share`."""
 
     @abstractmethod
@@ -118,10 +118,10 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     def fused(self, samples: Sequence[FusionSample]) -> list[Tensor]:
         """The fused maps, each (B, C, H, W), of B samples."""
-        agents = [seen for sample in samples for seen in sample.seen]
+        agents = [seen for sample in samples for seen in sample.observations]
         features = [torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)]
         shared = self.share(features)
-        counts = [len(sample.seen) for sample in samples]
+        counts = [len(sample.observations) for sample in samples]
         fused = [
             self._fuse(maps, sample.ego_SE2_agent)
             for sample, maps in zip(samples, zip(*(torch.split(m, counts) for m in shared), strict=True), strict=True)
@@ -146,8 +146,8 @@ class IntermediateFusion(FusionMethod, nn.Module):
         """
         warped = warp(maps, ego_SE2_agent, self.config)
         covered = coverage(maps, ego_SE2_agent, self.config)
-        if index < len(self.turns):
-            warped = self.turns[index](warped, [pose.yaw for pose in ego_SE2_agent], covered)
+        if index < len(self.conditioning):
+            warped = self.conditioning[index](warped, [pose.yaw for pose in ego_SE2_agent], covered)
         return warped, covered
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
@@ -223,7 +223,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
 class MultiScaleFusion(IntermediateFusion):
     """Shares the encoder's three maps as they are, fuses each, and decodes them as the detector does."""
 
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """Of the three maps."""
         return self.config.block_channels
 
@@ -240,7 +240,7 @@ class MultiScaleFusion(IntermediateFusion):
 class SingleMapFusion(IntermediateFusion):
     """Shares the one map at stride 2 that the neck makes of the three."""
 
-    def turned_channels(self) -> Sequence[int]:
+    def conditioned_channels(self) -> Sequence[int]:
         """Of the one map."""
         return [self.config.shrink_channels]
 

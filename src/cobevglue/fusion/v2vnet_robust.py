@@ -90,9 +90,9 @@ class V2VNetRobust(V2VNet):
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
         """The detector's loss, that of the corrections ("pose") and that of the messages' weights ("attention")."""
-        agents = [seen for sample in samples for seen in sample.seen]
+        agents = [seen for sample in samples for seen in sample.observations]
         shared = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
-        counts = [len(sample.seen) for sample in samples]
+        counts = [len(sample.observations) for sample in samples]
         maps, own = (torch.split(m, counts) for m in shared)
         parts = [self._sample_loss(maps[number], sample, number) for number, sample in enumerate(samples)]
         fused, pose, attention = (torch.stack(part) for part in zip(*parts, strict=True))

@@ -49,7 +49,7 @@ class DetectionConfig(Settings):
             more, weighted by the overlap and the inverse predicted variance (He et al., "Bounding Box Regression with
             Uncertainty for Accurate Object Detection", CVPR 2019). Which way they face is put to the vote, too.
         voting_iou: see there.
-        second_look: let the points on each box say which way it faces (`perception/facing.py`).
+        heading_refinement: let the points on each box say which way it faces (`perception/heading.py`).
     """
 
     score_threshold: _Share = 0.1
@@ -59,7 +59,7 @@ class DetectionConfig(Settings):
     uncertainty_penalty: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     variance_voting: bool = False
     voting_iou: _Share = 0.5
-    second_look: bool = True
+    heading_refinement: bool = True
 
 
 class PointPillarsConfig(Settings):

@@ -1,4 +1,4 @@
-"""From what the head says to boxes: the best-scored candidates, non-maximum suppression, and how sure each box is."""
+"""Decoding of the head's output: best-scored candidates, non-maximum suppression, box voting, variances."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Found(NamedTuple):
     Attributes:
         boxes: K boxes in the LiDAR's frame, best first, with score and label.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2]; of yaw modulo pi.
-        sure: (K,) how sure each is which way it faces, 0 to 1: by how much this way is more likely than the other.
+        heading_confidence: (K,) in [0, 1], the probability of this heading minus that of the opposite one.
     """
 
     boxes: Boxes
     variance: FloatArray
-    sure: FloatArray
+    heading_confidence: FloatArray
 
 
 def decode(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig) -> list[Found]:
@@ -71,24 +71,24 @@ def _decode_one(output: HeadOutput, anchors: AnchorGrid, config: DetectionConfig
     deviation = np.sqrt(variance[:, :2].sum(axis=1))
     ranked = candidates.replace(score=score * np.exp(-config.uncertainty_penalty * deviation))
     rows = nms(ranked, config.nms_iou)[: config.max_detections]
-    sure = np.tanh(np.abs(direction[:, 1] - direction[:, 0]) / 2)  # difference of the two probabilities
+    heading_confidence = np.tanh(np.abs(direction[:, 1] - direction[:, 0]) / 2)  # difference of the two probabilities
     boxes = candidates[rows]
     if config.variance_voting and len(boxes):
-        boxes, agreed = _vote(boxes, candidates, variance, sure, config.voting_iou)
+        boxes, agreed = _vote(boxes, candidates, variance, heading_confidence, config.voting_iou)
         return Found(boxes, variance[rows], agreed)
-    return Found(boxes, variance[rows], sure[rows])
+    return Found(boxes, variance[rows], heading_confidence[rows])
 
 
 def _vote(
-    boxes: Boxes, candidates: Boxes, variance: FloatArray, sure: FloatArray, min_iou: float
+    boxes: Boxes, candidates: Boxes, variance: FloatArray, heading_confidence: FloatArray, min_iou: float
 ) -> tuple[Boxes, FloatArray]:
-    """K boxes moved to what the C candidates that overlap them say on average, and (K,) how sure of their facing.
+    """K boxes moved to what the C candidates that overlap them say on average, and (K,) confidence of their heading.
 
     Args:
         boxes: those that stay.
         candidates: all, `boxes` among them, with scores.
         variance: (C, 3) of the candidates.
-        sure: (C,) how sure each is which way it faces, 0 to 1.
+        heading_confidence: (C,) confidence of the direction of the heading, in [0, 1].
         min_iou: candidates that overlap by less have no vote.
     """
     iou = bev_iou(boxes, candidates)
@@ -102,7 +102,7 @@ def _vote(
     turn = candidates.yaw - boxes.yaw[:, None]
     assert candidates.score is not None
     weight = vote * candidates.score
-    facing = (weight * sure * np.cos(turn)).sum(axis=1) / weight.sum(axis=1)
+    facing = (weight * heading_confidence * np.cos(turn)).sum(axis=1) / weight.sum(axis=1)
     turn -= math.pi * np.round(turn / math.pi)  # a flipped candidate knows the axis all the same
     yaw = wrap_angle(boxes.yaw + average(turn[..., None], vote / variance[:, 2])[:, 0] + math.pi * (facing < 0.0))
     rest = average(np.column_stack([candidates.center[:, 2], candidates.size])[None], vote)

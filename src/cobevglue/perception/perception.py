@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cobevglue.boxes import Boxes
-from cobevglue.perception.level import lifted, needed_raise
+from cobevglue.perception.ground_height import correct_height, estimate_height_correction
 from cobevglue.perception.point_pillars import PointPillars, check_points
 from cobevglue.tracking import Sort
 from cobevglue.typing import ArrayLike, Float32Array, FloatArray
@@ -21,18 +21,18 @@ __all__ = ["Perception", "PerceptionOutput"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerceptionOutput:
-    """What one agent sees in one frame, in its LiDAR's frame, but raised where the sensor stands unusually high or low.
+    """The perception of one agent in one frame, in its LiDAR frame after ground-height normalisation.
 
     Attributes:
-        points: (N, 4) float32 x, y, z [m], intensity: the cloud itself, raised.
+        points: (N, 4) float32 x, y, z [m], intensity: the normalised cloud.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
-        boxes: detections good enough to be tracked, with `track_id`: what the agent tells others. Each faces the way
-            that most detections of its track did; the rest is as it was seen now.
+        boxes: the tracked detections, with `track_id`: those that the agent transmits. Front or back is decided by
+            the votes of all detections of a track; everything else is of this frame.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2] of the K `boxes`.
-        detections: all detections, best first, down to the detector's own threshold; those in `boxes` face as there.
+        detections: all detections, best first, down to the detector's own threshold, with the headings of `boxes`.
         seconds: time spent in each stage [s].
-        raised: what was added to z [m] (`needed_raise`): 0 for a sensor on the roof of a car. Points and boxes of all
-            agents have the ground at the same height so.
+        height_correction: the offset added to z [m] (`estimate_height_correction`), so that the ground is at the same
+            height for all agents; 0 for a sensor on a car's roof.
     """
 
     points: Float32Array
@@ -41,7 +41,7 @@ class PerceptionOutput:
     variance: FloatArray
     detections: Boxes
     seconds: dict[str, float]
-    raised: float = 0.0
+    height_correction: float = 0.0
 
 
 class Perception:
@@ -50,8 +50,8 @@ class Perception:
     Args:
         detector: in evaluation mode.
         tracker: with default settings if None.
-        min_track_score: detections that score less are not tracked and not told to others: a false box is worse there
-            than a missing one.
+        min_track_score: detections that score less are neither tracked nor transmitted: for alignment a false box is
+            worse than a missing one.
     """
 
     def __init__(self, detector: PointPillars, tracker: Sort | None = None, min_track_score: float = 0.25) -> None:
@@ -77,8 +77,8 @@ class Perception:
             ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
         """
         checked = check_points(points)
-        raised = needed_raise(checked)
-        checked = lifted(checked, raised)
+        offset = estimate_height_correction(checked)
+        checked = correct_height(checked, offset)
         seconds: dict[str, float] = {}
         with self._timed("pillars", seconds):
             image = self.detector.encode([torch.from_numpy(checked)])
@@ -88,17 +88,17 @@ class Perception:
             output = self.detector.decode_features((first, second, third))
         with self._timed("boxes", seconds):
             (found,) = self.detector.boxes(output)
-        with self._timed("facing", seconds):
-            detections, variance, sure = self.detector.faced(found, checked)
+        with self._timed("heading", seconds):
+            detections, variance, heading_confidence = self.detector.refine_headings(found, checked)
         with self._timed("tracking", seconds):
             assert detections.score is not None
             good = detections.score >= self.min_track_score
-            tracked = self.tracker.faced(self.tracker.update(detections[good], time, sure[good]))
+            tracked = self.tracker.vote_headings(self.tracker.update(detections[good], time, heading_confidence[good]))
             yaw = detections.yaw.copy()
             yaw[good] = tracked.yaw
             detections = detections.replace(yaw=yaw)
         features = (first[0], second[0], third[0])
-        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
+        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, offset)
 
     @contextmanager
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:

@@ -21,9 +21,9 @@ from cobevglue.perception.backbone import Backbone, Neck
 from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from cobevglue.perception.config import PointPillarsConfig
 from cobevglue.perception.decode import Found, decode
-from cobevglue.perception.facing import FacingNet, face
+from cobevglue.perception.ground_height import correct_height, estimate_height_correction
 from cobevglue.perception.head import Head, HeadOutput
-from cobevglue.perception.level import lifted, needed_raise
+from cobevglue.perception.heading import HeadingRefiner, refine_headings
 from cobevglue.perception.pillars import PillarEncoder, batch_clouds
 from cobevglue.typing import ArrayLike, Float32Array, FloatArray
 
@@ -40,8 +40,8 @@ class PointPillars(nn.Module):
         boxes = detector.detect(points)  # (N, 4) x, y, z, intensity
 
     In three steps, so that fusion fits between: `forward` is `decode_features(multiscale(encode(clouds)))`. All maps
-    are (B, C, rows, columns); rows go along y and columns along x, both from min to max. `detect` looks a second time
-    at the points on what was found, to tell front from back (`facing`), which is trained on its own.
+    are (B, C, rows, columns); rows go along y and columns along x, both from min to max. `detect` adds heading
+    refinement (`heading_refiner`), a second stage on the points of each detection, which is trained separately.
 
     Args:
         config: settings; `CONFIGS` has two. Weights are random, from torch's generator.
@@ -63,7 +63,7 @@ class PointPillars(nn.Module):
         self.backbone = Backbone(config)
         self.neck = Neck(config)
         self.head = Head(config)
-        self.facing = FacingNet()
+        self.heading_refiner = HeadingRefiner()
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster so
 
     @property
@@ -95,19 +95,19 @@ class PointPillars(nn.Module):
         return self.decode_features(self.multiscale(self.encode(clouds)))
 
     def boxes(self, output: HeadOutput) -> list[Found]:
-        """What the head found in each cloud, best first."""
+        """The detections of each cloud, best first."""
         return decode(output, self.anchors, self.detection)
 
-    def faced(self, found: Found, points: Float32Array) -> Found:
-        """What the head found in a cloud (N, 4), the right way round, as far as a second look can tell."""
-        return face(found, points, self.facing) if self.detection.second_look else found
+    def refine_headings(self, found: Found, points: Float32Array) -> Found:
+        """Detections in a cloud (N, 4) after heading refinement, if `detection.heading_refinement` is set."""
+        return refine_headings(found, points, self.heading_refiner) if self.detection.heading_refinement else found
 
     def detect(self, points: ArrayLike) -> Boxes:
         """The vehicles in one cloud.
 
         Args:
-            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped. A cloud of a sensor
-                that stands much higher or lower than on a car is looked at as if it did not (`needed_raise`).
+            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped. Clouds of sensors
+                at unusual heights are normalised first (`estimate_height_correction`).
 
         Returns:
             Boxes in the LiDAR's frame, best first, with score and label.
@@ -131,14 +131,14 @@ class PointPillars(nn.Module):
         if not clouds:
             return []
         checked = [check_points(points) for points in clouds]
-        raised = [needed_raise(points) for points in checked]
-        level = [lifted(points, z) for points, z in zip(checked, raised, strict=True)]
+        offsets = [estimate_height_correction(points) for points in checked]
+        normalised = [correct_height(points, z) for points, z in zip(checked, offsets, strict=True)]
         with self._evaluating():
-            found = self.boxes(self([torch.from_numpy(points) for points in level]))
-            found = [self.faced(one, points) for one, points in zip(found, level, strict=True)]
+            found = self.boxes(self([torch.from_numpy(points) for points in normalised]))
+            found = [self.refine_headings(one, points) for one, points in zip(found, normalised, strict=True)]
         return [
             one._replace(boxes=one.boxes.replace(center=one.boxes.center - (0.0, 0.0, z)))
-            for one, z in zip(found, raised, strict=True)
+            for one, z in zip(found, offsets, strict=True)
         ]
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:

@@ -1,8 +1,8 @@
-"""Training: samples, augmentation, and the stages: the detector, its second look, then each fusion method.
+"""Training: samples, augmentation, and the stages: the detector, its heading refinement, then each fusion method.
 
     from cobevglue.training import load_config, train_detector
     train_detector(load_config("compact", ["optimisation.epochs=3"]), Path("runs/first"))
-    train_facing(load_facing_config("compact", ["detector=runs/first/last.safetensors"]), Path("runs/facing"))
+    train_heading(load_heading_config("compact", ["detector=runs/first/last.safetensors"]), Path("runs/facing"))
     train_fusion(load_fusion_config("coalign"), Path("runs/coalign"))
 
 `torchrun --nproc-per-node 2 -m cobevglue train detector` trains in two processes.
@@ -11,16 +11,16 @@
 from cobevglue.training.augmentation import AugmentationConfig, augment
 from cobevglue.training.config import PRESETS, DataConfig, TrainDetectorConfig, ValidationConfig, load_config
 from cobevglue.training.detector import TrainingResult, train_detector
-from cobevglue.training.facing import FACING_PRESETS, TrainFacingConfig, load_facing_config, train_facing
 from cobevglue.training.fusion import FUSION_PRESETS, TrainFusionConfig, load_fusion_config, train_fusion
 from cobevglue.training.fusion_features import FeatureConfig
+from cobevglue.training.heading import HEADING_PRESETS, TrainHeadingConfig, load_heading_config, train_heading
 from cobevglue.training.optimisation import OptimisationConfig
 from cobevglue.training.progress import DivergedError
 from cobevglue.training.samples import DatasetEpisodes, EpisodeSource
 
 __all__ = [
-    "FACING_PRESETS",
     "FUSION_PRESETS",
+    "HEADING_PRESETS",
     "PRESETS",
     "AugmentationConfig",
     "DataConfig",
@@ -30,15 +30,15 @@ __all__ = [
     "FeatureConfig",
     "OptimisationConfig",
     "TrainDetectorConfig",
-    "TrainFacingConfig",
     "TrainFusionConfig",
+    "TrainHeadingConfig",
     "TrainingResult",
     "ValidationConfig",
     "augment",
     "load_config",
-    "load_facing_config",
     "load_fusion_config",
+    "load_heading_config",
     "train_detector",
-    "train_facing",
     "train_fusion",
+    "train_heading",
 ]

@@ -109,7 +109,7 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.model = PointPillars(config.model)  # its convolutions are channels-last
-        self.model.facing.requires_grad_(False)  # looks at what was found: `train_facing`, afterwards
+        self.model.heading_refiner.requires_grad_(False)  # looks at what was found: `train_heading`, afterwards
         self.model.to(processes.device)
         self.loss = DetectionLoss(config.model)
         self.epoch, self.elapsed = 0, 0.0

@@ -114,9 +114,9 @@ class _Samples(Dataset[_Item]):
     def __getitem__(self, index: int) -> _Item:
         rng = np.random.default_rng([*self._seed, index])
         frame = self._frames[self._order[index]]
-        ego = int(rng.integers(len(frame.seen)))
+        ego = int(rng.integers(len(frame.observations)))
         frame = frame.with_ego(0 if self._merged else ego)
-        agents = 1 if rng.random() < self._alone else len(frame.seen)
+        agents = 1 if rng.random() < self._alone else len(frame.observations)
         return _Item(
             _sample(frame, agents, self._noise, rng),
             assign_targets(
@@ -225,7 +225,7 @@ def _validate(model: IntermediateFusion, frames: FusionFrames, report: Callable[
     with torch.inference_mode():
         for index in range(len(frames)):
             frame = frames[index]
-            (one,) = model.boxes(model([_sample(frame, len(frame.seen), (0.0, 0.0), rng)]))
+            (one,) = model.boxes(model([_sample(frame, len(frame.observations), (0.0, 0.0), rng)]))
             counts = np.where(frame.ignored, 0, 1)
             found.append(DetectionFrame(one.boxes, frame.truth, counts))
     (x_min, x_max), (y_min, y_max) = model.config.x_range, model.config.y_range
@@ -249,10 +249,10 @@ def _sample(frame: FusionFrame, agents: int, noise: tuple[float, float], rng: np
         return [SE2(), *(world[0].inverse() @ pose for pose in world[1:])]
 
     return FusionSample(
-        seen=frame.seen[:agents],
+        observations=frame.observations[:agents],
         ego_SE2_agent=seen_from_ego(world_SE2_claimed),
         true_ego_SE2_agent=seen_from_ego(world_SE2_true),
-        early_features=frame.early_features if agents == len(frame.seen) else None,
+        early_features=frame.early_features if agents == len(frame.observations) else None,
         truth=frame.truth[~frame.ignored],
     )
 

@@ -74,7 +74,7 @@ class FusionFrame:
         ignored: (K,) which of them are neither to be found nor wrong to find: hardly any points, or the ego itself.
     """
 
-    seen: tuple[PerceptionOutput, ...]
+    observations: tuple[PerceptionOutput, ...]
     world_SE3_agent: FloatArray
     early_features: tuple[Tensor, Tensor, Tensor] | None
     truth: Boxes
@@ -84,10 +84,10 @@ class FusionFrame:
         """The same frame with agent `number` as the ego; the vehicle of the ego before stays ignored."""
         if number == 0:
             return self
-        order = [number, *(other for other in range(len(self.seen)) if other != number)]
+        order = [number, *(other for other in range(len(self.observations)) if other != number)]
         poses = self.world_SE3_agent[order]
         truth = transform_boxes(self.truth, inverse_SE3(poses[0]) @ self.world_SE3_agent[0])
-        seen = tuple(self.seen[agent] for agent in order)
+        seen = tuple(self.observations[agent] for agent in order)
         return FusionFrame(seen, poses, None, truth, self.ignored | covers_origin(truth))
 
 
@@ -207,10 +207,10 @@ def _cropped(frame: Frame, agent: str, config: PointPillarsConfig) -> Float32Arr
 def _as_tensors(frame: FusionFrame) -> dict[str, Tensor]:
     tensors: dict[str, Any] = {"poses": frame.world_SE3_agent, "truth": _rows(frame.truth), "ignored": frame.ignored}
     assert frame.early_features is not None
-    views = {f"{i}": view.features for i, view in enumerate(frame.seen)} | {"early": frame.early_features}
+    views = {f"{i}": view.features for i, view in enumerate(frame.observations)} | {"early": frame.early_features}
     for name, maps in views.items():
         tensors |= {f"{name}.map{i}": m.half().contiguous() for i, m in enumerate(maps)}
-    for i, view in enumerate(frame.seen):
+    for i, view in enumerate(frame.observations):
         tensors |= {
             f"{i}.points": view.points,
             f"{i}.boxes": _rows(view.boxes),

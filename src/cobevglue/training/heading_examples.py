@@ -22,21 +22,21 @@ from cobevglue.datasets.whole_files import whole_file
 from cobevglue.iou import bev_iou
 from cobevglue.perception import PointPillars
 from cobevglue.perception.checkpoint import fingerprint
-from cobevglue.perception.facing import Looks, look_at
-from cobevglue.perception.level import lifted, needed_raise
+from cobevglue.perception.ground_height import correct_height, estimate_height_correction
+from cobevglue.perception.heading import HeadingInputs, heading_inputs
 from cobevglue.perception.point_pillars import check_points
 from cobevglue.se2 import wrap_angle
 from cobevglue.training.samples import EpisodeSource
 from cobevglue.training.shards import read_index, write_shards
 
-__all__ = ["FacingExamples", "examples_in", "write_facing_examples"]
+__all__ = ["HeadingExamples", "examples_in", "write_heading_examples"]
 
 _FOUND = 0.5
 """Overlap with an object from which on a box is of it, as where average precision is measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FacingExamples:
+class HeadingExamples:
     """Vehicles that were found.
 
     Attributes:
@@ -44,24 +44,24 @@ class FacingExamples:
         right: (K,) whether each box faces as its vehicle does.
     """
 
-    looks: Looks
+    looks: HeadingInputs
     right: Tensor
 
-    def to(self, device: torch.device) -> FacingExamples:
+    def to(self, device: torch.device) -> HeadingExamples:
         """The same on another device."""
-        return FacingExamples(Looks(*(values.to(device) for values in self.looks)), self.right.to(device))
+        return HeadingExamples(HeadingInputs(*(values.to(device) for values in self.looks)), self.right.to(device))
 
-    def take(self, rows: Tensor) -> FacingExamples:
+    def take(self, rows: Tensor) -> HeadingExamples:
         """Those in these rows, in the precision of a network."""
-        looks = Looks(*(values[rows] for values in self.looks))
-        return FacingExamples(looks._replace(points=looks.points.float()), self.right[rows])
+        looks = HeadingInputs(*(values[rows] for values in self.looks))
+        return HeadingExamples(looks._replace(points=looks.points.float()), self.right[rows])
 
 
 @torch.inference_mode()
-def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -> FacingExamples:
+def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -> HeadingExamples:
     """What the detector finds in a cloud, without what is no object or one with fewer points than `min_points`."""
     points = check_points(cloud.points)
-    points = lifted(points, needed_raise(points))
+    points = correct_height(points, estimate_height_correction(points))
     (found,) = detector.boxes(detector([torch.from_numpy(points)]))
     iou = bev_iou(found.boxes, cloud.boxes)
     best = iou.max(axis=1, initial=0.0)
@@ -69,11 +69,11 @@ def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -
     known = np.flatnonzero(best >= _FOUND)
     known = known[cloud.point_count[of[known]] >= min_points]
     right = np.abs(wrap_angle(found.boxes.yaw[known] - cloud.boxes.yaw[of[known]])) <= math.pi / 2
-    looks = Looks(*(values[torch.from_numpy(known)] for values in look_at(points, found)))
-    return FacingExamples(looks._replace(points=looks.points.half()), torch.from_numpy(right))
+    looks = HeadingInputs(*(values[torch.from_numpy(known)] for values in heading_inputs(points, found)))
+    return HeadingExamples(looks._replace(points=looks.points.half()), torch.from_numpy(right))
 
 
-def write_facing_examples(
+def write_heading_examples(
     folder: Path,
     source: EpisodeSource,
     config: Mapping[str, Any],
@@ -82,7 +82,7 @@ def write_facing_examples(
     autocast: torch.autocast,
     device: torch.device,
     report: Callable[[str], None],
-) -> FacingExamples:
+) -> HeadingExamples:
     """Look at episodes, or at those that are missing; a finished folder of the same settings is taken as it is.
 
     Args:
@@ -128,7 +128,7 @@ def _write(
         return []
     looks = {
         name: torch.cat(values)
-        for name, values in zip(Looks._fields, zip(*(e.looks for e in examples), strict=True), strict=True)
+        for name, values in zip(HeadingInputs._fields, zip(*(e.looks for e in examples), strict=True), strict=True)
     }
     file = folder / f"{episode:04d}.safetensors"
     with whole_file(file) as partly:
@@ -136,9 +136,9 @@ def _write(
     return [file.name]
 
 
-def _read(folder: Path) -> FacingExamples:
+def _read(folder: Path) -> HeadingExamples:
     parts = [load_file(folder / name) for name in read_index(folder)["files"]]
     if not sum(len(part["right"]) for part in parts):
         raise ValueError(f"{folder}: the detector found none of the objects")
-    joined = {name: torch.cat([part[name] for part in parts]) for name in (*Looks._fields, "right")}
-    return FacingExamples(Looks(*(joined[name] for name in Looks._fields)), joined["right"])
+    joined = {name: torch.cat([part[name] for part in parts]) for name in (*HeadingInputs._fields, "right")}
+    return HeadingExamples(HeadingInputs(*(joined[name] for name in HeadingInputs._fields)), joined["right"])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cobevglue.boxes import Boxes
-from cobevglue.fusion.facing import face_as_told
+from cobevglue.fusion.heading import vote_headings
 
 
 def cars(*rows: tuple[float, float, float], score: float | None = None) -> Boxes:
@@ -38,7 +38,7 @@ def cars(*rows: tuple[float, float, float], score: float | None = None) -> Boxes
 )
 def test_who_is_believed(told: list[Boxes], turned: bool) -> None:
     boxes = cars((0, 0, 0), score=0.7)
-    faced = face_as_told(boxes, told)
+    faced = vote_headings(boxes, told)
     assert bool(np.cos(faced.yaw[0]) < 0) == turned
     np.testing.assert_array_equal(faced.center, boxes.center)
     np.testing.assert_array_equal(faced.size, boxes.size)
@@ -50,6 +50,6 @@ def test_who_is_believed(told: list[Boxes], turned: bool) -> None:
 def test_only_half_turns_are_made_and_a_second_time_none(rows: list[tuple[float, float, float]], agents: int) -> None:
     boxes = cars(*rows)
     told = [cars((1.0, agent, 90.0 * agent), (-4.0, agent, 45.0)) for agent in range(agents)]
-    once = face_as_told(boxes, told)
+    once = vote_headings(boxes, told)
     np.testing.assert_allclose(np.abs(np.sin(once.yaw - boxes.yaw)), 0.0, atol=1e-9)
-    np.testing.assert_allclose(face_as_told(once, told).yaw, once.yaw)
+    np.testing.assert_allclose(vote_headings(once, told).yaw, once.yaw)

@@ -1,4 +1,4 @@
-"""Perception over a drive: what every agent saw in every frame, and the truth about it."""
+"""Perception over a sequence: the observations of every agent in every frame, and the ground truth."""
 
 from __future__ import annotations
 
@@ -12,62 +12,62 @@ from cobevglue.boxes import Boxes
 from cobevglue.datasets.frame import AgentFrame, Frame
 from cobevglue.datasets.labelled_cloud import count_points
 from cobevglue.datasets.poses import inverse_SE3, transform_boxes
-from cobevglue.disturbance import Moment
+from cobevglue.disturbance import ObservedFrame
 from cobevglue.experiments.results import FrameTruth
 from cobevglue.iou import bev_iou
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars
 from cobevglue.typing import BoolArray, Float32Array
 
-__all__ = ["Drive"]
+__all__ = ["ObservedSequence"]
 
 _DETECTED_IOU = 0.1
 """An object is detected when a tracked box overlaps it by more."""
 
 
 @dataclass
-class Drive:
-    """What is seen on a drive. `moments` and `truth` grow as `see` goes on.
+class ObservedSequence:
+    """Observations of all agents over a sequence. `frames` and `truth` grow with each call of `observe`.
 
     The ego is the first vehicle, in the order of names, of the first frame in which a vehicle has a cloud. Agents
-    without a cloud are not there, and frames without the ego are left out; both are counted. Agents may come and go.
+    without a cloud are skipped, and frames without the ego are skipped; both are counted. Agents may come and go.
 
     Attributes:
         detector: of all agents.
-        ego: its name; "" before it was seen.
-        moments: what all agents saw. Views that are older than those of the last `see` are forgotten, poses are kept.
-        truth: of the same frames.
-        left_out: what was not used, and how often.
+        ego: its name; "" before the first frame with an ego.
+        frames: observations and poses of all agents; `drop_observations` frees the former.
+        truth: ground truth of the same frames.
+        left_out: reasons for skipping, with their counts.
     """
 
     detector: PointPillars
     ego: str = ""
-    moments: list[Moment] = field(default_factory=list)
+    frames: list[ObservedFrame] = field(default_factory=list)
     truth: list[FrameTruth] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     _perception: dict[str, Perception] = field(default_factory=dict)
 
-    def see(self, frames: Iterable[Frame]) -> range:
-        """Go on through these frames.
+    def observe(self, frames: Iterable[Frame]) -> range:
+        """Run the perception of all agents on the next frames of the sequence.
 
         Returns:
-            The numbers of the new moments.
+            The indices of the new frames.
 
         Raises:
             ValueError: a broken file; names it.
         """
-        first = len(self.moments)
+        first = len(self.frames)
         for frame in frames:
-            self._see(frame)
-        return range(first, len(self.moments))
+            self._observe(frame)
+        return range(first, len(self.frames))
 
-    def forget_views(self, before: int) -> None:
-        """Give back the memory of what was seen before moment `before`; poses stay."""
+    def drop_observations(self, before: int) -> None:
+        """Free the memory of the observations before frame `before`; poses are kept."""
         for index in range(before):
-            old = self.moments[index]
-            if old.seen:
-                self.moments[index] = Moment(old.time, {}, old.claimed, old.true)
+            old = self.frames[index]
+            if old.observations:
+                self.frames[index] = ObservedFrame(old.time, {}, old.claimed, old.true)
 
-    def _see(self, frame: Frame) -> None:
+    def _observe(self, frame: Frame) -> None:
         clouds = dict(self._clouds(frame))
         if not self.ego:
             self.ego = next((name for name in clouds if not frame.agents[name].is_infrastructure), "")
@@ -80,7 +80,7 @@ class Drive:
             perception = self._perception.setdefault(name, Perception(self.detector))
             seen[name] = perception.step(points, frame.time)
         poses = {name: agent.world_SE3_lidar for name, agent in agents.items()}
-        self.moments.append(Moment(frame.time, seen, poses, poses))
+        self.frames.append(ObservedFrame(frame.time, seen, poses, poses))
         self.truth.append(_truth(frame, self.ego, agents, seen))
 
     def _clouds(self, frame: Frame) -> Iterator[tuple[str, Float32Array]]:
@@ -101,7 +101,7 @@ def _truth(
     for name, agent in agents.items():
         agent_SE3_ego = inverse_SE3(agent.world_SE3_lidar) @ agents[ego].world_SE3_lidar
         there = transform_boxes(objects, agent_SE3_ego)
-        raised = there.replace(center=there.center + (0.0, 0.0, seen[name].raised))
+        raised = there.replace(center=there.center + (0.0, 0.0, seen[name].height_correction))
         points += count_points(seen[name].points, raised)
         detected[name] = _detected(there, seen[name].boxes)
     co_visible = {name: int((detected[ego] & rows).sum()) for name, rows in detected.items() if name != ego}

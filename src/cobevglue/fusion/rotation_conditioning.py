@@ -1,10 +1,10 @@
-"""What an agent's features say of directions, said in the ego's directions.
+"""Rotation-conditioned features: an agent's feature map adapted to its heading in the ego's frame.
 
-A detector's features tell which way things face, and that in the frame of the agent whose points they are of. Warping
-takes a feature to where it belongs and leaves what it says: a car that faces along the other's x axis still does, also
-where the other drives across the ego's road. Networks that are trained end to end have to live with that; on a frozen
-encoder it costs more than collaboration gains (`docs/collaboration.md` has the figures). As the angle between the two
-is known, a feature can be told it.
+A detector's features encode headings in the frame of the agent whose points they come from. Warping moves a feature to
+its position in the ego's frame but does not change what it encodes: a car along the other agent's x axis still appears
+so, also where the other agent drives across the ego's road. Networks trained end to end have to cope with that; with a
+frozen encoder it costs more than collaboration gains (`docs/collaboration.md` has the figures). The angle between the
+two agents is known, so the features are conditioned on it.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["Turn"]
+__all__ = ["RotationConditioning"]
 
 _HARMONICS = 2
 """Sines and cosines of the angle, and of twice the angle: boxes are nearly the same after half a turn."""
 
 
-class Turn(nn.Module):
-    """Adds to a map what changes with the angle. It is our addition to all methods that share maps.
+class RotationConditioning(nn.Module):
+    """A residual layer on feature maps, conditioned on the rotation; our addition to all methods that share maps.
 
-    A layer whose weights are trigonometric polynomials of the angle, a ReLU, and a convolution; at first it adds 0. The
-    ego's own map goes through it, too, at angle 0: so a frozen encoder's features can become ones that are fit to be
-    put together.
+    A 1 x 1 convolution whose weights are trigonometric polynomials of the angle, a ReLU, and a 3 x 3 convolution that
+    is initialised with 0. The ego's own map passes through it, too, at angle 0, which adapts a frozen encoder's
+    features to fusion.
 
     Args:
         channels: C of the maps.
@@ -43,7 +43,7 @@ class Turn(nn.Module):
             nn.init.zeros_(self.last.bias)
 
     def forward(self, maps: Tensor, yaws: Sequence[float], covered: Tensor) -> Tensor:
-        """The same maps in the ego's directions.
+        """The maps, adapted to the rotation.
 
         Args:
             maps: (B, C, H, W) of B agents, warped.
@@ -55,11 +55,11 @@ class Turn(nn.Module):
         """
         if not len(maps):
             return maps
-        told = torch.cat([self._told(one[None], yaw) for one, yaw in zip(maps, yaws, strict=True)])
-        turned: Tensor = torch.relu(maps + self.last(torch.relu(told)))
+        conditioned = torch.cat([self._conditioned(one[None], yaw) for one, yaw in zip(maps, yaws, strict=True)])
+        turned: Tensor = torch.relu(maps + self.last(torch.relu(conditioned)))
         return turned * (covered > 0)
 
-    def _told(self, maps: Tensor, yaw: float) -> Tensor:
+    def _conditioned(self, maps: Tensor, yaw: float) -> Tensor:
         basis = [1.0]
         for harmonic in range(1, _HARMONICS + 1):
             basis += [math.cos(harmonic * yaw), math.sin(harmonic * yaw)]

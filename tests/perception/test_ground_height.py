@@ -10,7 +10,7 @@ from cobevglue.datasets.frame import Frame
 from cobevglue.datasets.labelled_cloud import count_points
 from cobevglue.iou import bev_iou
 from cobevglue.perception import Perception, PointPillars
-from cobevglue.perception.level import needed_raise
+from cobevglue.perception.ground_height import estimate_height_correction
 from cobevglue.typing import Float32Array
 
 
@@ -34,22 +34,22 @@ def cloud(height: float, count: int = 2000, more: Float32Array | None = None) ->
     ],
 )
 def test_the_ground_comes_to_where_it_is_expected(height: float, wanted: float) -> None:
-    assert needed_raise(cloud(height)) == pytest.approx(wanted, abs=0.02)
+    assert estimate_height_correction(cloud(height)) == pytest.approx(wanted, abs=0.02)
 
 
 def test_the_body_below_the_sensor_is_not_taken_for_the_ground() -> None:
     roof = np.zeros((5000, 4), np.float32) + np.array([0.5, 0.0, -0.3, 0.0], np.float32)
-    assert needed_raise(cloud(1.9, more=roof)) == 0.0
+    assert estimate_height_correction(cloud(1.9, more=roof)) == 0.0
 
 
 @pytest.mark.parametrize("count", [0, 50])
 def test_of_hardly_any_points_nothing_is_said(count: int) -> None:
-    assert needed_raise(cloud(5.0, count)) == 0.0
+    assert estimate_height_correction(cloud(5.0, count)) == 0.0
 
 
 def test_points_without_a_height_do_not_count() -> None:
     holes = np.full((3000, 4), np.nan, np.float32)
-    assert needed_raise(cloud(5.0, more=holes)) == pytest.approx(3.1, abs=0.02)
+    assert estimate_height_correction(cloud(5.0, more=holes)) == pytest.approx(3.1, abs=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_sensor_on_a_mast_sees_vehicles_where_they_are(mast: Frame) -> None:
     agent, detector = mast.agents["-1"], PointPillars.pretrained("compact")
     assert agent.points is not None
     points = agent.points
-    assert needed_raise(points) > 2.0
+    assert estimate_height_correction(points) > 2.0
     seen = agent.objects[count_points(points, agent.objects) >= 20]
     found = detector.detect(points)
     pairs = np.argwhere(bev_iou(seen, found) > 0.5)
@@ -73,7 +73,7 @@ def test_a_sensor_on_a_mast_sees_vehicles_where_they_are(mast: Frame) -> None:
     assert len(set(pairs[:, 0])) > 0.7 * len(seen)
     height = found.center[pairs[:, 1], 2] - seen.center[pairs[:, 0], 2]
     assert abs(np.median(height)) < 0.3  # in the LiDAR's frame again
-    assert Perception(detector).step(points).raised == needed_raise(points)
+    assert Perception(detector).step(points).height_correction == estimate_height_correction(points)
 
 
 def test_a_car_and_a_mast_see_together(mast: Frame) -> None:

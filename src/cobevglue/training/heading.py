@@ -1,4 +1,4 @@
-"""The training of a detector's second look, which tells front from back: `train_facing`. Minutes on a CPU."""
+"""The training of a detector's heading refinement, which tells front from back: `train_heading`. Minutes on a CPU."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from pydantic import Field
 from torch import Tensor
 
 from cobevglue.perception import PointPillars
-from cobevglue.perception.facing import FacingNet, Looks
+from cobevglue.perception.heading import HeadingInputs, HeadingRefiner
 from cobevglue.settings import Settings
 from cobevglue.torch_device import chosen_device
 from cobevglue.torch_threads import torch_threads
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import TrainingResult
-from cobevglue.training.facing_examples import FacingExamples, write_facing_examples
+from cobevglue.training.heading_examples import HeadingExamples, write_heading_examples
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
 from cobevglue.training.progress import EpochProgress
 from cobevglue.training.run_log import RunLog, print_progress
 from cobevglue.training.sources import make_source
 
 __all__ = [
-    "FACING_PRESETS",
-    "FacingAugmentation",
-    "TrainFacingConfig",
+    "HEADING_PRESETS",
+    "HeadingAugmentation",
+    "TrainHeadingConfig",
     "augmented",
-    "load_facing_config",
-    "train_facing",
+    "load_heading_config",
+    "train_heading",
 ]
 
-_STAGE = "facing"
+_STAGE = "heading"
 _SAMPLE_STREAM = 100
 
 _Count = Annotated[int, Field(ge=1)]
 _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 
-class FacingAugmentation(Settings):
+class HeadingAugmentation(Settings):
     """How looks are changed, so that nothing in them is relied on alone: other shapes, other sensors, other traffic.
 
     Attributes:
@@ -61,8 +61,8 @@ class FacingAugmentation(Settings):
     unsure: _Share = 0.2
 
 
-class TrainFacingConfig(Settings):
-    """Settings of `train_facing`.
+class TrainHeadingConfig(Settings):
+    """Settings of `train_heading`.
 
     Attributes:
         detector: that looks a second time; a name of shipped weights, or a file of a run. All else in it stays.
@@ -73,7 +73,7 @@ class TrainFacingConfig(Settings):
         augmentation: how what is seen of a vehicle is changed.
         optimisation: how weights are found; a sample is a vehicle.
         seed: of the episodes, the first weights and the order of samples.
-        init_from: a detector, named like `detector`, whose second look is where to start.
+        init_from: a detector, named like `detector`, whose heading refinement is where to start.
         device: looks at clouds and learns; "auto" takes CUDA where there is one.
         threads: of torch; as many processes look at clouds.
         report_every: time between lines of progress [s].
@@ -83,8 +83,8 @@ class TrainFacingConfig(Settings):
     data: DataConfig = DataConfig(min_points=2)
     episodes: _Count = 1800
     validation_episodes: _Count = 24
-    examples: Path = Path("runs/facing-examples")
-    augmentation: FacingAugmentation = FacingAugmentation()
+    examples: Path = Path("runs/heading-examples")
+    augmentation: HeadingAugmentation = HeadingAugmentation()
     optimisation: OptimisationConfig = OptimisationConfig(
         epochs=15, samples_per_epoch=400_000, batch_size=256, learning_rate=3e-3, warm_up=0.3, mean_decay=0.99
     )
@@ -99,14 +99,14 @@ FREE_TO_CHANGE = {"examples", "device", "threads", "report_every"}
 """A run may be resumed with other values of these."""
 
 
-def train_facing(
-    config: TrainFacingConfig,
+def train_heading(
+    config: TrainHeadingConfig,
     folder: Path,
     *,
     resume: bool = False,
     report: Callable[[str], None] = print_progress,
 ) -> TrainingResult:
-    """Train the second look of a detector, or go on with a run that was interrupted.
+    """Train heading refinement of a detector, or go on with a run that was interrupted.
 
     Args:
         config: settings.
@@ -124,11 +124,11 @@ def train_facing(
 
 
 def _train(
-    config: TrainFacingConfig, folder: Path, resume: bool, device: torch.device, report: Callable[[str], None]
+    config: TrainHeadingConfig, folder: Path, resume: bool, device: torch.device, report: Callable[[str], None]
 ) -> TrainingResult:
     optimisation = config.optimisation
     detector = PointPillars.named(config.detector)
-    # How the detector came about stays known; of an earlier second look nothing is left.
+    # How the detector came about stays known; of an earlier heading refinement nothing is left.
     earlier = detector.metadata.get("stages", [detector.metadata])
     detector.metadata = {"stages": [stage for stage in earlier if stage.get("stage") != _STAGE]}
     state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume, device=device)
@@ -136,9 +136,9 @@ def _train(
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        net = FacingNet().to(device)
+        net = HeadingRefiner().to(device)
     if config.init_from is not None:
-        net.load_state_dict(PointPillars.named(config.init_from).facing.state_dict())
+        net.load_state_dict(PointPillars.named(config.init_from).heading_refiner.state_dict())
     learner = Learner(net, optimisation, state)
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     metrics: dict[str, float] = {}
@@ -153,7 +153,7 @@ def _train(
                 log.add("validation", (epoch + 1) * steps, epoch + 1, metrics)
                 report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
             elapsed += time.monotonic() - started
-            detector.facing.load_state_dict(learner.mean.state_dict())
+            detector.heading_refiner.load_state_dict(learner.mean.state_dict())
             known = {"stage": _STAGE, "training": config.model_dump(mode="json"), "epoch": epoch + 1}
             detector.save(folder / LAST, {**provenance(), **known, "seconds": round(elapsed), "metrics": metrics})
             save_state(folder / STATE, learner.state(config, epoch + 1, elapsed))
@@ -161,12 +161,12 @@ def _train(
 
 
 def _examples(
-    config: TrainFacingConfig,
+    config: TrainHeadingConfig,
     detector: PointPillars,
     measured: bool,
     device: torch.device,
     report: Callable[[str], None],
-) -> FacingExamples:
+) -> HeadingExamples:
     """What the detector finds in the training or the validation split, on `device`."""
     split = config.data.validation_split if measured else config.data.split
     described = {
@@ -179,13 +179,13 @@ def _examples(
     source = make_source(config.data, config.seed, validation=measured)
     folder = config.examples / split
     look = autocast(config.optimisation, device)
-    return write_facing_examples(folder, source, described, detector, config.threads, look, device, report).to(device)
+    return write_heading_examples(folder, source, described, detector, config.threads, look, device, report).to(device)
 
 
 def _train_epoch(
-    config: TrainFacingConfig,
-    examples: FacingExamples,
-    learner: Learner[FacingNet],
+    config: TrainHeadingConfig,
+    examples: HeadingExamples,
+    learner: Learner[HeadingRefiner],
     epoch: int,
     log: RunLog,
     report: Callable[[str], None],
@@ -208,7 +208,7 @@ def _train_epoch(
         progress.add({"total": loss, "flipped": flipped}, rate)
 
 
-def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator) -> Looks:
+def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.Generator) -> HeadingInputs:
     """Other looks at the same K vehicles, which face as before.
 
     Args:
@@ -230,12 +230,12 @@ def augmented(looks: Looks, config: FacingAugmentation, random: torch.Generator)
     points = points + config.jitter * torch.randn(points.shape, generator=random, device=points.device)
     around = around * (uniform(k, 1, 1) >= config.alone)
     vehicle = torch.cat([vehicle[:, :8], vehicle[:, 8:] * (uniform(k, 1) >= config.unsure)], dim=1)
-    return Looks(points, left, vehicle, around)
+    return HeadingInputs(points, left, vehicle, around)
 
 
 @torch.inference_mode()
-def _measure(net: FacingNet, examples: FacingExamples) -> dict[str, float]:
-    """The loss, and the share of vehicles that are the wrong way round, without a second look and with it."""
+def _measure(net: HeadingRefiner, examples: HeadingExamples) -> dict[str, float]:
+    """The loss, and the share of vehicles that are the wrong way round, without heading refinement and with it."""
     right = examples.right
     every = torch.arange(len(right), device=right.device)
     logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(every, 1024)])
@@ -246,18 +246,18 @@ def _measure(net: FacingNet, examples: FacingExamples) -> dict[str, float]:
     }
 
 
-FACING_PRESETS: dict[str, TrainFacingConfig] = {
-    "compact": TrainFacingConfig(),
-    "opv2v": TrainFacingConfig(detector="opv2v"),
+HEADING_PRESETS: dict[str, TrainHeadingConfig] = {
+    "compact": TrainHeadingConfig(),
+    "opv2v": TrainHeadingConfig(detector="opv2v"),
 }
 """Shipped settings by the name of the detector."""
 
 
-def load_facing_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainFacingConfig:
+def load_heading_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainHeadingConfig:
     """Settings by name or from a YAML file, with single values changed; see `load_config`.
 
     Raises:
         ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
         FileNotFoundError: there is no such file.
     """
-    return settings_from(FACING_PRESETS, "compact", name_or_file, changes)
+    return settings_from(HEADING_PRESETS, "compact", name_or_file, changes)
