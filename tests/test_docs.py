@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -133,3 +135,26 @@ def test_the_program_keeps_line_numbers_of_the_page() -> None:
     text = "# Page\n\n```python\na = 1\n```\n\n```python\nb = 2\n```\n"
     lines, program = text.split("\n"), script(snippets(text)).split("\n")
     assert [lines[number] for number, line in enumerate(program) if line] == ["a = 1", "b = 2"]
+
+
+@pytest.mark.parametrize(
+    ("markdown", "expected"),
+    [
+        ("[guide](user_guide.md#limits)", "[guide](user_guide.md#limits)"),
+        ("[file](../src/cobevglue/se2.py)", "file"),
+        ("[paper](https://arxiv.org/abs/2406.12712)", "[paper](https://arxiv.org/abs/2406.12712)"),
+        ("![picture](images/demo.png)", "![picture](images/demo.png)"),
+        ("[report](results/index.html)", "report"),
+    ],
+    ids=[
+        "another page stays",
+        "a source file",
+        "an address stays",
+        "a picture stays",
+        "a page that is not on the site",
+    ],
+)
+def test_the_site_has_no_dead_links(markdown: str, expected: str) -> None:
+    hooks = runpy.run_path(str(PROJECT / "tools" / "mkdocs_hooks.py"))
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="architecture.md"))
+    assert hooks["on_page_markdown"](markdown, page=page) == expected
