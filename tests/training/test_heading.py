@@ -66,7 +66,7 @@ def test_training_changes_the_heading_refiner_alone(examples: Path, tmp_path: Pa
     changed = {
         name.split(".")[0] for name, value in before.state_dict().items() if not torch.equal(value, theirs[name])
     }
-    assert changed == {"heading"}
+    assert changed == {"heading_refiner"}
     assert after.metadata["training"]["episodes"] == 2
     assert after.metadata["metrics"] == result.metrics
     detectors = [stage for stage in before.metadata["stages"] if "train detector" in stage["command"]]
