@@ -171,7 +171,7 @@ class CoBEVGlue:
             pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
             whole = Observation(view.boxes, view.variance, view.points, view.features, pose)
             try:
-                needed = self.aligner.heading_inputs(whole)
+                needed = self.aligner.select_inputs(whole)
             except ValueError as error:
                 raise ValueError(f"{agent}: {error}") from None
             if agent != ego:

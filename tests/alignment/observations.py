@@ -30,7 +30,7 @@ def align(aligner: GroupAligner, observations: Mapping[str, Observation]) -> dic
     ego = next(iter(observations))
     seen = {}
     for name, observation in observations.items():
-        needed = aligner.heading_inputs(observation)
+        needed = aligner.select_inputs(observation)
         seen[name] = needed if name == ego else aligner.decode(aligner.encode(name, needed, 0.0, 0), needed)
     return aligner.align_group(ego, seen)
 

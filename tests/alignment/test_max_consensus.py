@@ -146,7 +146,7 @@ def test_next_to_no_boxes_leave_the_claimed_pose(ego: int, other: int) -> None:
 
 def test_it_asks_for_a_pose() -> None:
     with pytest.raises(ValueError, match="MaximumConsensus needs pose of every agent"):
-        MaximumConsensus().heading_inputs(Observation(boxes=Boxes.empty()))
+        MaximumConsensus().select_inputs(Observation(boxes=Boxes.empty()))
 
 
 @pytest.mark.parametrize(

@@ -272,9 +272,9 @@ def test_without_conflicts_landmarks_are_the_connected_components(seed: int) -> 
 def test_it_asks_for_what_it_needs() -> None:
     observation = Observation(boxes=FOUR, pose=pose_of(CAR1))
     with pytest.raises(ValueError, match="CoAlign needs variance of every agent"):
-        CoAlign().heading_inputs(observation)
+        CoAlign().select_inputs(observation)
     with pytest.raises(ValueError, match="CoAlign needs pose of every agent"):
-        CoAlign().heading_inputs(Observation(boxes=FOUR, variance=np.ones((4, 3))))
+        CoAlign().select_inputs(Observation(boxes=FOUR, variance=np.ones((4, 3))))
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def aligner(name: str, budget: int | None = None) -> PointAligner:
 
 def seen_by(name: str, cloud: Float32Array = CLOUD) -> Observation:
     """All that an agent knows, as far as this aligner may look at it."""
-    return aligner(name).heading_inputs(Observation(points=cloud, pose=pose_of(SE2(3.0, 4.0, 0.5))))
+    return aligner(name).select_inputs(Observation(points=cloud, pose=pose_of(SE2(3.0, 4.0, 0.5))))
 
 
 def sent(name: str, budget: int | None, observation: Observation, frame: int = 0) -> dict[str, bytes]:
@@ -120,7 +120,7 @@ def test_the_sample_is_spread_evenly() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_nobody_is_told_more_than_is_needed(name: str) -> None:
     everything = Observation(points=CLOUD, pose=np.eye(4), variance=np.ones((0, 3)))
-    needed = aligner(name).heading_inputs(everything)
+    needed = aligner(name).select_inputs(everything)
     assert (needed.variance, needed.boxes, needed.features) == (None, None, None)
     assert (needed.pose is None) == (name == "fpfh-teaser")
     assert set(sent(name, None, needed)) == {"points"} | ({"pose"} if "icp" in name else set())
@@ -129,7 +129,7 @@ def test_nobody_is_told_more_than_is_needed(name: str) -> None:
 @pytest.mark.parametrize("name", ["icp-2d", "icp-3d"])
 def test_a_refinement_asks_for_a_pose(name: str) -> None:
     with pytest.raises(ValueError, match="needs pose of every agent"):
-        aligner(name).heading_inputs(Observation(points=CLOUD))
+        aligner(name).select_inputs(Observation(points=CLOUD))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -151,3 +151,32 @@ def test_the_untouched_ascii_cloud_and_the_binary_one_of_the_same_frame_agree(cu
     known = {tuple(row) for row in np.round(ascii_points * [100, 100, 100, 255]).astype(int)}
     found = [tuple(row) in known for row in np.round(binary * [100, 100, 100, 255]).astype(int)]
     assert np.mean(found) > 0.97
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(
+    ("count", "fields"),
+    [
+        (None, "x y z intensity"),  # COUNT is left out: one of each
+        ("1 1 1 1", "x y z intensity"),
+        ("1 1 0 1 1", "x y normal z intensity"),  # a field of COUNT 0 holds no data
+    ],
+)
+def test_fields_with_count_zero_or_none(tmp_path: Path, encoding: Encoding, count: str | None, fields: str) -> None:
+    path = save(tmp_path / "a.pcd", encoding, "intensity", np.array([0.0, 0.5, 1.0], dtype=np.float32))
+    header, data = path.read_bytes().split(b"DATA", 1)
+    n = len(fields.split())
+    kept = [
+        line for line in header.split(b"\n") if line.split()[:1] not in ([b"FIELDS"], [b"SIZE"], [b"TYPE"], [b"COUNT"])
+    ]
+    kept += [f"FIELDS {fields}".encode(), b"SIZE" + b" 4" * n, b"TYPE" + b" F" * n]
+    kept += [] if count is None else [f"COUNT {count}".encode()]
+    path.write_bytes(b"\n".join([line for line in kept if line]) + b"\nDATA" + data)
+    points = read_pcd(path)
+    np.testing.assert_array_equal(points[:, :3], POINTS)
+    np.testing.assert_array_equal(points[:, 3], [0.0, 0.5, 1.0])
+
+
+def test_points_with_nan_intensity_are_kept(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.pcd", Encoding.BINARY, "intensity", np.array([np.nan, 0.5, 1.0], dtype=np.float32))
+    np.testing.assert_array_equal(read_pcd(path)[:, 3], [0.0, 0.5, 1.0])

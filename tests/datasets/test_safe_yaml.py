@@ -112,3 +112,8 @@ def test_bytes_that_are_no_text_and_a_missing_file(tmp_path: Path) -> None:
         read_yaml(tmp_path / "f.yaml", ("a",))
     with pytest.raises(FileNotFoundError, match=r"g\.yaml"):
         read_yaml(tmp_path / "g.yaml", ("a",))
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_bytes(b"\xef\xbb\xbfa: 1\nb: 2\n")
+    assert read_yaml(tmp_path / "f.yaml", ("a", "b")) == {"a": 1, "b": 2}

@@ -172,6 +172,7 @@ def test_a_second_object_with_the_same_association_keeps_its_own_id(tmp_path: Pa
         (np.eye(4), {3: vehicle(1, 2, 0, extent=[-1, 1, 1])}, r"vehicles\.3\.extent is negative"),
         (np.eye(4), {3: vehicle(1, float("nan"), 0)}, r"vehicles\.3\.location"),
         (np.eye(4), {3: vehicle(1, 2, 0) | {"ass_id": "none"}}, "vehicles: "),
+        (np.eye(4), {3: {k: v for k, v in vehicle(1, 2, 0).items() if k != "ass_id"}}, r"vehicles\.3 has no ass_id"),
     ],
 )
 def test_a_broken_file_names_itself_and_the_field(tmp_path: Path, lidar_pose: Any, vehicles: Any, message: str) -> None:
@@ -185,3 +186,13 @@ def test_an_agent_folder_of_another_name_is_named(tmp_path: Path) -> None:
     path = write_frame(tmp_path, "000000", np.eye(4), {3: vehicle(1, 2, 0)})
     with pytest.raises(ValueError, match="ego"):
         read_v2v4real_labels_yaml(path, agent="ego")
+
+
+@pytest.mark.parametrize(("kind", "label"), [("Pedestrian", None), ("Car", "car"), ("TrafficCone", "trafficcone")])
+def test_object_type_is_read_as_obj_type(tmp_path: Path, kind: str, label: str | None) -> None:
+    """Conversions of RCooper and V2X-Real name the field so; unknown classes keep their name."""
+    entry = vehicle(1, 2, 0)
+    entry["object_type"] = kind
+    del entry["obj_type"]
+    _, objects = read_v2v4real_labels_yaml(write_frame(tmp_path, "000000", np.eye(4), {1: entry}), agent="0")
+    assert (None if objects.label is None or not len(objects) else objects.label.tolist()) == (label and [label])

@@ -15,7 +15,7 @@ from cobevglue.perception import PointPillarsConfig
 from cobevglue.perception.pillars import PillarEncoder, batch_clouds
 from cobevglue.typing import ArrayLike
 
-CONFIG = PointPillarsConfig(x_range=(-3.2, 3.2), y_range=(0.0, 3.2), pillar_channels=5, use_intensity=True)
+CONFIG = PointPillarsConfig(x_range=(-3.2, 3.2), y_range=(0.0, 3.2), pillar_channels=16, use_intensity=True)
 """8 rows, 16 columns."""
 
 
@@ -81,7 +81,6 @@ def test_rows_are_y_and_columns_are_x_from_min_to_max() -> None:
         [math.nan, 1, 0, 0],
         [0, math.inf, 0, 0],
         [0, 1, -math.inf, 0],
-        [0, 1, 0, math.nan],
         [1e30, 1, 0, 0],
     ],
 )

@@ -74,6 +74,31 @@ def test_bad_points_are_named(detector: PointPillars, points: Any, message: str)
         detector.detect(points)
 
 
+@pytest.mark.parametrize(
+    ("rows", "same"),
+    [
+        (np.zeros((300, 4)), True),  # missing returns, as several drivers store them
+        (np.full((300, 4), np.nan), True),
+        (np.tile([0.0, 0.0, -1.0, 0.0], (300, 1)), False),  # below the sensor, but a point
+    ],
+)
+def test_missing_returns_are_dropped_and_counted(trained: PointPillars, rows: np.ndarray, same: bool) -> None:
+    from cobevglue.perception import Perception
+
+    out = Perception(trained).step(np.vstack([CLOUD, rows]))
+    assert out.dropped_points == len(rows) * same
+    assert len(out.points) == len(CLOUD) + len(rows) * (not same)
+    if same:
+        np.testing.assert_array_equal(trained.detect(np.vstack([CLOUD, rows])).bev, trained.detect(CLOUD).bev)
+
+
+def test_nan_intensity_does_not_matter(trained: PointPillars) -> None:
+    cloud = CLOUD.copy()
+    cloud[:, 3] = np.nan
+    assert len(trained.detect(cloud)) > 0
+    np.testing.assert_array_equal(trained.detect(cloud).bev, trained.detect(CLOUD).bev)
+
+
 def test_rows_with_nan_and_the_order_of_points_do_not_matter(trained: PointPillars) -> None:
     shuffled = np.random.default_rng(0).permutation(np.vstack([CLOUD, np.full((50, 4), np.nan)]))
     assert np.allclose(trained.detect(shuffled).bev, trained.detect(CLOUD).bev, atol=1e-3)
@@ -104,7 +129,7 @@ def test_points_moved_by_whole_cells_move_everything(trained: PointPillars) -> N
 
 def test_maps_are_halved_three_times(detector: PointPillars) -> None:
     image = detector.encode([torch.from_numpy(CLOUD)])
-    assert image.shape == (1, 12, 48, 64)
+    assert image.shape == (1, 16, 48, 64)
     assert [tuple(m.shape[1:]) for m in detector.multiscale(image)] == [(12, 24, 32), (16, 12, 16), (24, 6, 8)]
 
 
@@ -133,6 +158,7 @@ def test_the_configurations_have_the_sizes_that_the_papers_use(name: str, grid: 
         ({"z_range": (1, 1)}, "z_range"),
         ({"pillar": 0}, "pillar"),
         ({"shrink_kernel": 2}, "shrink_kernel"),
+        ({"pillar_channels": 24}, "pillar_channels: must be a multiple of 16, got 24; .*AVX-512"),
         ({"negative_iou": 0.9}, "negative_iou"),
         ({"anchors": ()}, "anchors"),
         ({"pillar_chanels": 3}, "did you mean 'pillar_channels'"),

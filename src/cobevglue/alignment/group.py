@@ -70,7 +70,7 @@ class GroupAligner(ABC):
     def reset(self) -> None:  # noqa: B027  # not abstract: most remember nothing
         """Forget everything seen so far; nothing to do for those that remember nothing."""
 
-    def heading_inputs(self, observation: Observation) -> Observation:
+    def select_inputs(self, observation: Observation) -> Observation:
         """The part of an observation that this aligner is given.
 
         Raises:

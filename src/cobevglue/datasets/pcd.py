@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +24,8 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
     integer stored under the type float. In ASCII files that shows as numbers like 1.5e-38.
 
     Args:
-        path: the file, with fields x, y, z and either `intensity`, or `rgb`; with neither the intensity is 0.
+        path: the file, with fields x, y, z and either `intensity`, or `rgb`; with neither the intensity is 0. A NaN
+            intensity becomes 0.
         left_handed: the file has y to the right: mirror it.
         intensity_scale: factor that brings the field `intensity` to [0, 1]. Not applied to `rgb`, which is 8 bit.
 
@@ -52,7 +55,8 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
             raise ValueError(f"{path}: the field 'rgb' must have 4 bytes, got {data.dtype['rgb'].itemsize}")
         packed = np.ascontiguousarray(data["rgb"]).view(np.uint32)
         points[:, 3] = ((packed >> 16) & 0xFF) / 255.0
-    return points[np.isfinite(points).all(axis=1)]
+    points[~np.isfinite(points[:, 3]), 3] = 0.0
+    return points[np.isfinite(points[:, :3]).all(axis=1)]
 
 
 def write_pcd_rgb(path: Path, points: ArrayLike, left_handed: bool = True) -> None:
@@ -113,7 +117,7 @@ def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of an empty table; the count below says more
-            cloud = PointCloud.from_path(path)
+            cloud = PointCloud.from_fileobj(io.BufferedReader(io.BytesIO(_with_counts(path.read_bytes()))))
         # (a table of one row loses its axis in numpy's text reader)
         data: np.ndarray[tuple[int], np.dtype[Any]] = np.atleast_1d(cloud.pc_data)
         promised = int(cloud.metadata.points)
@@ -122,3 +126,31 @@ def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
     if len(data) != promised:
         raise ValueError(f"{path}: the header promises {promised} points, the file has {len(data)}")
     return data
+
+
+def _with_counts(content: bytes) -> bytes:
+    """The file with a COUNT of at least 1 for every field, as `pypcd4` requires.
+
+    COUNT may be missing (it defaults to 1). Fields of COUNT 0, which some sensor vendors export, hold no data.
+    """
+    data = re.search(rb"(?m)^DATA\b", content)
+    if data is None:
+        return content  # the parser says what is missing
+    start = data.start()
+    lines = content[:start].split(b"\n")
+    header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    fields = header.get(b"FIELDS", [])
+    counts = header.get(b"COUNT")
+    if counts is not None and b"0" not in counts:
+        return content
+    if counts is not None and len(counts) != len(fields):
+        return content
+    kept = [row for row in range(len(fields)) if counts is None or counts[row] != b"0"]
+    try:
+        table = {name: [header[name][row] for row in kept] for name in (b"FIELDS", b"SIZE", b"TYPE")}
+    except (KeyError, IndexError):
+        return content  # the parser says what is missing
+    table[b"COUNT"] = [b"1" if counts is None else counts[row] for row in kept]
+    rows = [b" ".join([name, *values]) for name, values in table.items()]
+    rest = [line for line in lines if line.split() and line.split()[0] not in table]
+    return b"\n".join([*rows, *rest, content[start:]])

@@ -40,7 +40,7 @@ def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
         ValueError: it is not YAML, not a mapping, or has a tag that is not plain data; names the file.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # a byte-order mark is no part of the first key
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is not there") from None
     except UnicodeDecodeError as error:

@@ -25,7 +25,7 @@ import numpy as np
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.pcd import read_pcd
 from cobevglue.datasets.poses import mirrored, rigid_SE3
-from cobevglue.datasets.yaml_tree import LabelReader, YamlTree, read_objects
+from cobevglue.datasets.yaml_tree import LabelReader, ObjectTable, YamlTree, read_objects
 from cobevglue.typing import Float32Array, FloatArray
 
 __all__ = ["LEFT_HANDED", "V2V4Real", "read_v2v4real_labels_yaml"]
@@ -88,11 +88,22 @@ def read_v2v4real_labels_yaml(path: Path, agent: str, left_handed: bool = LEFT_H
         world_SE3_lidar, center, yaw = mirrored(world_SE3_lidar), center * [1.0, -1.0, 1.0], -yaw
     # Roll and pitch are in the LiDAR frame itself: set upright, a box keeps its yaw.
     try:
-        ids = _common_ids(table.ids, [entry.get("ass_id", -1) for entry in table.entries], int(agent))
+        ids = _common_ids(table.ids, _associations(path, table), int(agent))
         boxes = Boxes(center=center, size=table.size, yaw=yaw, track_id=ids, label=table.kinds)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: vehicles: {error}") from None
     return world_SE3_lidar, boxes
+
+
+def _associations(path: Path, table: ObjectTable) -> list[int]:
+    """`ass_id` of each object. Without it an object that both agents observe would count as two."""
+    for own_id, entry in zip(table.ids, table.entries, strict=True):
+        if "ass_id" not in entry:
+            raise ValueError(
+                f"{path}: vehicles.{own_id} has no ass_id, the id that is common to both agents (-1: not associated); "
+                "read files of conversions whose own ids are common, such as RCooper's, with OPV2V's or add ass_id"
+            )
+    return [entry["ass_id"] for entry in table.entries]
 
 
 def _common_ids(own: list[int], associated: list[int], agent: int) -> list[int]:

@@ -128,7 +128,8 @@ class ObjectTable:
             where = f"{path}: vehicles.{key}"
             if not isinstance(entry, Mapping):
                 raise ValueError(f"{where} must be a mapping, got {type(entry).__name__}")
-            kind = str(entry.get("obj_type") or "car").lower()
+            # RCooper and V2X-Real, converted to this layout, call it `object_type`.
+            kind = str(entry.get("obj_type") or entry.get("object_type") or "car").lower()
             if kind in skip_kinds:
                 continue
             extent = _triple(where, entry, "extent")

@@ -71,7 +71,9 @@ class PointPillarsConfig(Settings):
         z_range: along z [m].
         pillar: side of a pillar [m].
         use_intensity: give the network the points' intensity; not where each sensor means something else by it.
-        pillar_channels: channels of the pseudo-image.
+        pillar_channels: channels of the pseudo-image, a multiple of 16: on AVX-512 processors torch 2.13 (oneDNN) may
+            write beyond its buffers in the backward pass of a first convolution with 12 input channels. Other
+            versions of torch were not tried.
         block_layers: residual blocks at strides 2, 4 and 8.
         block_channels: their channels.
         up_channels: channels that each of the three maps is brought to at stride 2.
@@ -84,7 +86,8 @@ class PointPillarsConfig(Settings):
         detection: how boxes are chosen.
 
     Raises:
-        ValueError: a value out of range, an unknown field, an empty range, or one that is no multiple of 8 pillars.
+        ValueError: a value out of range, an unknown field, an empty range, one that is no multiple of 8 pillars, or
+            `pillar_channels` that is no multiple of 16.
     """
 
     x_range: _Range = (-70.4, 70.4)
@@ -92,7 +95,7 @@ class PointPillarsConfig(Settings):
     z_range: _Range = (-3.0, 1.0)
     pillar: _Positive = 0.4
     use_intensity: bool = False
-    pillar_channels: _Count = 32
+    pillar_channels: Annotated[int, Field(ge=16)] = 32
     block_layers: tuple[_Count, _Count, _Count] = (1, 2, 2)
     block_channels: tuple[_Count, _Count, _Count] = (48, 96, 128)
     up_channels: _Count = 48
@@ -115,6 +118,11 @@ class PointPillarsConfig(Settings):
                 raise ValueError(
                     f"{name}: {low} to {high} m is not a multiple of {STRIDES[-1]} pillars of {self.pillar} m"
                 )
+        if self.pillar_channels % 16:
+            raise ValueError(
+                f"pillar_channels: must be a multiple of 16, got {self.pillar_channels}; with others torch 2.13 may "
+                "corrupt memory in training on AVX-512 processors (oneDNN's convolution_backward_weights)"
+            )
         if not self.z_range[0] < self.z_range[1]:
             raise ValueError(f"z_range: {self.z_range[0]} to {self.z_range[1]} m is empty")
         if self.shrink_kernel == 2:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,6 +34,7 @@ class PerceptionOutput:
         seconds: time spent in each stage [s].
         height_correction: the offset added to z [m] (`estimate_height_correction`), so that the ground is at the same
             height for all agents; 0 for a sensor on a car's roof.
+        dropped_points: number of points without a valid return: not finite, or at (0, 0, 0).
     """
 
     points: Float32Array
@@ -42,6 +44,7 @@ class PerceptionOutput:
     detections: Boxes
     seconds: dict[str, float]
     height_correction: float = 0.0
+    dropped_points: int = 0
 
 
 class Perception:
@@ -77,6 +80,7 @@ class Perception:
             ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
         """
         checked = check_points(points)
+        dropped = len(np.asarray(points)) - len(checked)
         offset = estimate_height_correction(checked)
         checked = correct_height(checked, offset)
         seconds: dict[str, float] = {}
@@ -98,7 +102,7 @@ class Perception:
             yaw[good] = tracked.yaw
             detections = detections.replace(yaw=yaw)
         features = (first[0], second[0], third[0])
-        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, offset)
+        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, offset, dropped)
 
     @contextmanager
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:

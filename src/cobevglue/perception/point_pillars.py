@@ -238,7 +238,16 @@ class _BehindPillars(nn.Module):
 
 
 def check_points(points: ArrayLike) -> Float32Array:
-    """A point cloud (N, 4) in float32.
+    """The valid returns of a point cloud, in float32.
+
+    Dropped are points with a coordinate that is not finite, and points at exactly (0, 0, 0), as which several LiDAR
+    drivers store missing returns. The intensity may be NaN: no network uses it by default.
+
+    Args:
+        points: (N, 4) x, y, z [m], intensity, in the LiDAR frame.
+
+    Returns:
+        (M, 4) with M <= N, in the same order.
 
     Raises:
         ValueError: not numbers, or of another shape; says what it is instead.
@@ -254,4 +263,6 @@ def check_points(points: ArrayLike) -> Float32Array:
     if array.ndim != 2 or array.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4): x, y, z [m], intensity; got {array.shape}")
     with np.errstate(over="ignore"):  # what is too large for float32 is out of range too
-        return np.ascontiguousarray(array, dtype=np.float32)
+        cloud = np.ascontiguousarray(array, dtype=np.float32)
+    valid = np.isfinite(cloud[:, :3]).all(axis=1) & cloud[:, :3].any(axis=1)
+    return cloud if valid.all() else cloud[valid]
