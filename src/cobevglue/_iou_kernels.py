@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from cobevglue._kernels import kernel
 from cobevglue.typing import FloatArray, IntArray
 
 _SCRATCH = 20
 """Corners that fit: four cuts make at most 8 of a quadrilateral, and at most 4 * 1.5^4 whatever rounding does."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def iou_matrix(a: FloatArray, b: FloatArray) -> FloatArray:
     """(N, M) intersection over union of every row of `a` with every row of `b`."""
     iou = np.zeros((len(a), len(b)))
@@ -32,7 +32,7 @@ def iou_matrix(a: FloatArray, b: FloatArray) -> FloatArray:
     return iou
 
 
-@numba.njit(cache=True)
+@kernel()
 def giou_matrix(a: FloatArray, b: FloatArray, max_distance: float) -> FloatArray:
     """(N, M) generalised IoU; -1 for pairs whose centres are further apart than `max_distance`."""
     giou = np.full((len(a), len(b)), -1.0)
@@ -48,7 +48,7 @@ def giou_matrix(a: FloatArray, b: FloatArray, max_distance: float) -> FloatArray
     return giou
 
 
-@numba.njit(cache=True)
+@kernel()
 def greedy_nms(boxes: FloatArray, order: IntArray, iou_threshold: float) -> IntArray:
     """The rows of `order` that overlap no earlier kept row by more than the threshold, in that order."""
     kept = np.empty(len(order), dtype=np.int64)
@@ -71,14 +71,14 @@ def greedy_nms(boxes: FloatArray, order: IntArray, iou_threshold: float) -> IntA
     return kept[:n_kept].copy()
 
 
-@numba.njit(cache=True)
+@kernel()
 def _circumradius(boxes: FloatArray) -> FloatArray:
     """(N,) radius of the circle around each box: two boxes whose circles are apart cannot overlap."""
     radius: FloatArray = 0.5 * np.sqrt(boxes[:, 2] ** 2 + boxes[:, 3] ** 2)
     return radius
 
 
-@numba.njit(cache=True)
+@kernel()
 def _corners_in_frame_of(a: FloatArray, b: FloatArray, corners: FloatArray) -> None:
     """Write the corners of `b`, counter-clockwise, in the frame of `a` into the first four rows of `corners`."""
     cos_a, sin_a = math.cos(a[4]), math.sin(a[4])
@@ -93,7 +93,7 @@ def _corners_in_frame_of(a: FloatArray, b: FloatArray, corners: FloatArray) -> N
     corners[3, 0], corners[3, 1] = x + lx - wx, y + ly - wy
 
 
-@numba.njit(cache=True)
+@kernel()
 def _iou(a: FloatArray, b: FloatArray, polygon: FloatArray, clipped: FloatArray) -> float:
     """IoU of two boxes; `polygon` and `clipped` (_SCRATCH, 2) are overwritten."""
     _corners_in_frame_of(a, b, polygon)
@@ -117,7 +117,7 @@ def _iou(a: FloatArray, b: FloatArray, polygon: FloatArray, clipped: FloatArray)
     return iou
 
 
-@numba.njit(cache=True)
+@kernel()
 def _cut(polygon: FloatArray, n: int, axis: int, sign: float, limit: float, out: FloatArray) -> int:
     """Keep the part of a convex polygon where sign * coordinate <= limit; returns its number of corners."""
     other = 1 - axis
@@ -138,7 +138,7 @@ def _cut(polygon: FloatArray, n: int, axis: int, sign: float, limit: float, out:
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def _area(polygon: FloatArray, n: int) -> float:
     """Area of the first `n` corners, counter-clockwise (shoelace)."""
     twice = 0.0
@@ -148,7 +148,7 @@ def _area(polygon: FloatArray, n: int) -> float:
     return 0.5 * twice
 
 
-@numba.njit(cache=True)
+@kernel()
 def _hull_area(a: FloatArray, b: FloatArray, points: FloatArray, hull: FloatArray) -> float:
     """Area of the convex hull of two boxes (Andrew's monotone chain); `points` (8, 2), `hull` (17, 2) are scratch."""
     _corners_in_frame_of(a, b, points)

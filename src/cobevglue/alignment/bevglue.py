@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -218,17 +216,7 @@ def _fit_covariance(arms: FloatArray, position_std: float) -> FloatArray:
 
 
 def _load_kernels() -> ModuleType:
-    """Import the numba kernels: only here, because numba takes longer to import than everything else together.
-
-    numba caches each compiled function beside its own file and does not see that a function it inlined from another
-    file has changed. So compiled functions older than any of the sources are removed first.
-    """
-    folder = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
-    for index in (folder / "__pycache__").glob("*.nbi"):
-        with contextlib.suppress(OSError):  # another process was faster, or the folder is read-only
-            if index.stat().st_mtime < newest:
-                index.unlink()
+    """Import the numba kernels: only here, because numba takes longer to import than everything else together."""
     from cobevglue.alignment import pose_filter
 
     return pose_filter

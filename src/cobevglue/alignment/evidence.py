@@ -15,8 +15,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cobevglue._kernels import kernel
 from cobevglue.typing import FloatArray
 
 X, Y, LENGTH, WIDTH, YAW = range(5)
@@ -44,19 +44,19 @@ class NoiseModel(NamedTuple):
     one_to_one: bool
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def wrap(angle: float) -> float:
     """The same angle in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def wrap_half_turn(angle: float) -> float:
     """The same axis in [-pi/2, pi/2): headings that differ by 180 degrees are equal."""
     return (angle + 0.5 * math.pi) % math.pi - 0.5 * math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def size_evidence(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> FloatArray:
     """(M, N) evidence of the footprints alone, heavy-tailed (Student t, 3 degrees of freedom) in length and width."""
     table = np.zeros((len(ego), len(other)))
@@ -70,7 +70,7 @@ def size_evidence(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> Floa
     return table
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def pair_evidence(
     squared_distance: float, heading_difference: float, position_variance: float, noise: NoiseModel
 ) -> float:

@@ -16,8 +16,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cobevglue._kernels import kernel
 from cobevglue.alignment.evidence import NoiseModel, X, Y, size_evidence, wrap
 from cobevglue.alignment.pose_search import (
     SAME_ANGLE,
@@ -82,7 +82,7 @@ class Motion(NamedTuple):
     use_tracks: bool
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _mix(cov, i: int, k: int, factor: float) -> None:
     """What adding `factor` times component k to component i of the state does to its covariance."""
     for j in range(6):
@@ -91,7 +91,7 @@ def _mix(cov, i: int, k: int, factor: float) -> None:
         cov[j, i] += factor * cov[j, k]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _predict(h, dt: float, motion: Motion) -> None:
     """Constant-twist step of the Kalman filter: the velocity turns with the relative yaw.
 
@@ -117,7 +117,7 @@ def _predict(h, dt: float, motion: Motion) -> None:
         h.cov[i + 3, i + 3] += q * dt
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _move_pivot(h, other_x: float, other_y: float) -> None:
     """Write the same pose, rate and covariance down at another point of other's frame."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
@@ -133,7 +133,7 @@ def _move_pivot(h, other_x: float, other_y: float) -> None:
         _mix(h.cov, i + 1, i // 3 * 3 + 2, x)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _correct(h, star, correlation) -> None:
     """Kalman update with a refitted star: at its pivot x, y and yaw are measured independently, one after another."""
     _move_pivot(h, star.other_x, star.other_y)
@@ -169,7 +169,7 @@ def _correct(h, star, correlation) -> None:
         h.rate[j] += change[3 + j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _start(h, star, motion) -> None:
     """Begin anew at a refitted star's pose; nothing is known of its rate."""
     h.ego_x, h.ego_y, h.other_x, h.other_y = star.ego_x, star.ego_y, star.other_x, star.other_y
@@ -186,7 +186,7 @@ def _start(h, star, motion) -> None:
     h.cov[5, 5] = motion.yaw_rate_std**2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:
     """The star a predicted hypothesis finds where its motion says it should be."""
     star.ego_x, star.ego_y, star.other_x, star.other_y, star.yaw = h.ego_x, h.ego_y, h.other_x, h.other_y, h.yaw
@@ -195,7 +195,7 @@ def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:
     refine(ego, other, sizes, star, pairs, noise, rounds)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:
     """Write the rows of the track pairs matched last time that both agents still track; how many there are."""
     count = 0
@@ -210,7 +210,7 @@ def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _remember(h, star, pairs, ego_ids, other_ids) -> None:
     """Keep the star's evidence and the track ids of its best pairs."""
     h.frame_evidence = star.evidence
@@ -222,7 +222,7 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
         h.other_id[k] = other_ids[pairs[k, 1]]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _at_origin(h):
     """x, y, yaw and their (3, 3) covariance at the origin of other's frame instead of the pivot."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
@@ -239,7 +239,7 @@ def _at_origin(h):
     return h.ego_x - rx, h.ego_y - ry, h.yaw, covariance
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _landing_std(h, other) -> float:
     """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
     total = 0.0
@@ -249,7 +249,7 @@ def _landing_std(h, other) -> float:
     return total / len(other) if len(other) else np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries, rounds):
     """One frame: predict, follow, search, link, update.
 

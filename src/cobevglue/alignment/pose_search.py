@@ -20,8 +20,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from cobevglue._kernels import kernel
 from cobevglue.alignment.evidence import YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
 from cobevglue.typing import FloatArray, IntArray
 
@@ -78,13 +78,13 @@ _SAME_SEED_ANGLE = 0.35
 """A matched pair whose headings turn by nearly the star's yaw would be refined to the same star again [rad]."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def most_pairs(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> int:
     """How many pairs a star can have."""
     return min(len(ego), len(other)) if noise.one_to_one else len(ego) + len(other)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     """Find the pairs that agree with a star's pose, one-to-one, best evidence first.
 
@@ -150,7 +150,7 @@ def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     star.pairs = kept
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fit_pose(ego, other, star, pairs, noise) -> None:
     """Refit a star's pose to its pairs: Procrustes on the centres (paper, Eq. 7), blended with the headings.
 
@@ -187,7 +187,7 @@ def fit_pose(ego, other, star, pairs, noise) -> None:
     star.yaw_variance = 1.0 / information
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def refine(ego, other, sizes, star, pairs, noise, rounds) -> None:
     """Match and refit by turns, starting from the star's pose; ends without pairs when nothing agrees."""
     for i in range(rounds + 1):
@@ -200,7 +200,7 @@ def refine(ego, other, sizes, star, pairs, noise, rounds) -> None:
             return
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def same_pose(a, b, distance, angle) -> bool:
     """Whether two records' poses put a's pivot within `distance` [m] and differ by less than `angle` [rad]."""
     if abs(wrap(a.yaw - b.yaw)) > angle:
@@ -211,7 +211,7 @@ def same_pose(a, b, distance, angle) -> bool:
     return (x - a.ego_x) ** 2 + (y - a.ego_y) ** 2 < distance * distance
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def copy_pairs(target, source, count) -> None:
     """Copy the first `count` pairs."""
     # Loops, here and elsewhere: numba compiles slices and array expressions far more slowly, and runs them no faster.
@@ -220,7 +220,7 @@ def copy_pairs(target, source, count) -> None:
         target[k, 1] = source[k, 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def add_star(stars, rows, count, star, pairs) -> int:
     """Add a star to the first `count` of `stars` and return their new number.
 
@@ -243,7 +243,7 @@ def add_star(stars, rows, count, star, pairs) -> int:
     return kept
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _nearest_raster(ego):
     """Which ego box is nearest to each cell: (cells, cells) rows or -1, with origin x, y and the cell [m]."""
     low_x = high_x = ego[0, X]
@@ -272,7 +272,7 @@ def _nearest_raster(ego):
     return nearest, low_x, low_y, cell
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _smallest(values: FloatArray, rows: IntArray) -> None:
     """Fill `rows` with the rows of the smallest values, smallest first."""
     count = 0
@@ -288,7 +288,7 @@ def _smallest(values: FloatArray, rows: IntArray) -> None:
         count = min(count + 1, len(rows))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _seed_rows(sizes: FloatArray) -> IntArray:
     """The rows of other that seed stars: all, or those whose sizes agree with the fewest of ego's boxes."""
     m_count, n_count = sizes.shape
@@ -307,7 +307,7 @@ def _seed_rows(sizes: FloatArray) -> IntArray:
     return rows
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _directions(boxes):
     """Cosines and sines of the headings."""
     cos, sin = np.empty(len(boxes)), np.empty(len(boxes))
@@ -316,7 +316,7 @@ def _directions(boxes):
     return cos, sin
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _score_seeds(ego, other, sizes, noise):
     """Every seed's rough evidence: (S,) scores and (S, 3) ego row, other row, flipped."""
     m_count, n_count = len(ego), len(other)
@@ -386,7 +386,7 @@ def _score_seeds(ego, other, sizes, noise):
     return score[:count], seed[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def search(ego, other, sizes, noise, tries, rounds, stars, rows):
     """Find the best stars of one pair of frames, no two of them with the same pose.
 
