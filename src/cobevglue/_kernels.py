@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numba
 
@@ -34,14 +34,14 @@ def kernel(error_model: Literal["python", "numpy"] = "python") -> Callable[[_Fun
     """
 
     def compiled(function: _Function) -> _Function:
-        dispatcher = numba.njit(error_model=error_model)(function)
+        dispatcher: Any = numba.njit(error_model=error_model)(function)
         try:
             dispatcher.enable_caching()
         except RuntimeError:  # numba found no writable folder
             _warn_of_no_cache()
         else:
             dispatcher._cache._cache_file._source_stamp = _source_hash()
-        return dispatcher  # type: ignore[no-any-return]
+        return cast(_Function, dispatcher)
 
     return compiled
 
