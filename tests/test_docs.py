@@ -58,7 +58,7 @@ def run(page: Path, blocks: list[Snippet], folder: Path) -> None:
     done = subprocess.run(
         [sys.executable, program], cwd=folder, capture_output=True, text=True, timeout=300, check=False
     )
-    assert done.returncode == 0, f"{page.name}:\n{done.stderr[-2000:]}"
+    assert done.returncode == 0, f"{page.name}: exit status {done.returncode}\n{done.stderr[-2000:]}"
 
 
 def anchors(page: Path) -> set[str]:
@@ -158,3 +158,10 @@ def test_the_site_has_no_dead_links(markdown: str, expected: str) -> None:
     hooks = runpy.run_path(str(PROJECT / "tools" / "mkdocs_hooks.py"))
     page = SimpleNamespace(file=SimpleNamespace(src_uri="architecture.md"))
     assert hooks["on_page_markdown"](markdown, page=page) == expected
+
+
+def test_api_reference_names_every_package() -> None:
+    reference = "\n".join(page.read_text(encoding="utf-8") for page in (PROJECT / "docs" / "api").glob("*.md"))
+    packages = {path.parent.name for path in (PROJECT / "src" / "cobevglue").glob("*/__init__.py")} - {"cli"}
+    named = set(re.findall(r"^::: cobevglue\.(\w+)", reference, re.MULTILINE))
+    assert packages - named == set()
