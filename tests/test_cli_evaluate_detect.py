@@ -36,7 +36,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
         x_range=(-25.6, 25.6),
         y_range=(-12.8, 12.8),
         pillar=0.8,
-        pillar_channels=4,
+        pillar_channels=16,
         block_layers=(1, 1, 1),
         block_channels=(4, 4, 4),
         up_channels=4,

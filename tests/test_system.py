@@ -20,7 +20,7 @@ from cobevglue.perception import PointPillars, PointPillarsConfig
 from cobevglue.se2 import SE2
 
 SMALL = PointPillarsConfig(
-    x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 8),
+    x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=16, block_layers=(1, 1, 1), block_channels=(8, 8, 8),
     up_channels=8, shrink_channels=8,
 )  # fmt: skip
 

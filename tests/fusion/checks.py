@@ -23,7 +23,7 @@ from cobevglue.typing import Float32Array
 Method = TypeVar("Method", bound=IntermediateFusion)
 
 SMALL = PointPillarsConfig(
-    x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 12),
+    x_range=(-12.8, 12.8), y_range=(-6.4, 6.4), pillar_channels=16, block_layers=(1, 1, 1), block_channels=(8, 8, 12),
     up_channels=8, shrink_channels=8,
 )  # fmt: skip
 FAR = SE2(1000.0, 0.0, 0.3)

@@ -14,7 +14,7 @@ from cobevglue.typing import Float32Array, FloatArray
 SMALL = PointPillarsConfig(
     x_range=(-12.8, 12.8),
     y_range=(-9.6, 9.6),
-    pillar_channels=12,
+    pillar_channels=16,
     block_layers=(1, 1, 1),
     block_channels=(12, 16, 24),
     up_channels=12,

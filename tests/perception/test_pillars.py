@@ -15,14 +15,14 @@ from cobevglue.perception import PointPillarsConfig
 from cobevglue.perception.pillars import PillarEncoder, batch_clouds
 from cobevglue.typing import ArrayLike
 
-CONFIG = PointPillarsConfig(x_range=(-3.2, 3.2), y_range=(0.0, 3.2), pillar_channels=5, use_intensity=True)
+CONFIG = PointPillarsConfig(x_range=(-3.2, 3.2), y_range=(0.0, 3.2), pillar_channels=16, use_intensity=True)
 """8 rows, 16 columns."""
 
 
 def encoder(training: bool = False) -> PillarEncoder:
     torch.manual_seed(1)
     pillars = PillarEncoder(CONFIG)
-    pillars.norm.running_mean = torch.randn(5)
+    pillars.norm.running_mean = torch.randn(16)
     return pillars.train(training)
 
 
@@ -34,7 +34,7 @@ def image_of(*clouds: ArrayLike, pillars: PillarEncoder | None = None) -> torch.
 
 def naive(cloud: np.ndarray, pillars: PillarEncoder) -> torch.Tensor:
     """As the paper says it, pillar by pillar and point by point."""
-    image = torch.zeros(5, 8, 16)
+    image = torch.zeros(16, 8, 16)
     groups: dict[tuple[int, int], list[np.ndarray]] = {}
     for point in cloud.astype(np.float64):
         if np.isfinite(point).all() and -3.2 <= point[0] < 3.2 and 0 <= point[1] < 3.2 and -3 <= point[2] < 1:
@@ -107,7 +107,7 @@ def test_training_on_empty_clouds_works(clouds: list[np.ndarray]) -> None:
 def test_gradients_are_those_of_a_loop() -> None:
     cloud = np.random.default_rng(1).uniform(-1, 3, (40, 4))
     gradients = []
-    weight = torch.randn(5, 8, 16)
+    weight = torch.randn(16, 8, 16)
     for image in (lambda p: image_of(cloud, pillars=p)[0], lambda p: naive(cloud, p)):
         pillars = encoder()
         (image(pillars) * weight).sum().backward()  # type: ignore[no-untyped-call]

@@ -104,7 +104,7 @@ def test_points_moved_by_whole_cells_move_everything(trained: PointPillars) -> N
 
 def test_maps_are_halved_three_times(detector: PointPillars) -> None:
     image = detector.encode([torch.from_numpy(CLOUD)])
-    assert image.shape == (1, 12, 48, 64)
+    assert image.shape == (1, 16, 48, 64)
     assert [tuple(m.shape[1:]) for m in detector.multiscale(image)] == [(12, 24, 32), (16, 12, 16), (24, 6, 8)]
 
 
@@ -133,6 +133,7 @@ def test_the_configurations_have_the_sizes_that_the_papers_use(name: str, grid: 
         ({"z_range": (1, 1)}, "z_range"),
         ({"pillar": 0}, "pillar"),
         ({"shrink_kernel": 2}, "shrink_kernel"),
+        ({"pillar_channels": 12}, "pillar_channels: must be a multiple of 16, got 12: .* AVX-512"),
         ({"negative_iou": 0.9}, "negative_iou"),
         ({"anchors": ()}, "anchors"),
         ({"pillar_chanels": 3}, "did you mean 'pillar_channels'"),

@@ -18,7 +18,7 @@ from cobevglue.training.fusion_features import FusionFrames, write_features
 from cobevglue.training.optimisation import OptimisationConfig
 
 SMALL = PointPillarsConfig(
-    x_range=(-25.6, 25.6), y_range=(-12.8, 12.8), pillar_channels=8, block_layers=(1, 1, 1), block_channels=(8, 8, 8),
+    x_range=(-25.6, 25.6), y_range=(-12.8, 12.8), pillar_channels=16, block_layers=(1, 1, 1), block_channels=(8, 8, 8),
     up_channels=8, shrink_channels=8,
 )  # fmt: skip
 FRAMES = FeatureConfig(scenarios=2, frames=2, agents=(2, 3))
