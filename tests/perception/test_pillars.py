@@ -81,7 +81,6 @@ def test_rows_are_y_and_columns_are_x_from_min_to_max() -> None:
         [math.nan, 1, 0, 0],
         [0, math.inf, 0, 0],
         [0, 1, -math.inf, 0],
-        [0, 1, 0, math.nan],
         [1e30, 1, 0, 0],
     ],
 )
@@ -89,6 +88,12 @@ def test_points_out_of_range_or_not_finite_change_nothing(point: list[float]) ->
     good = [[0.5, 1, 0, 0.5], [0.6, 1.1, -1, 0.2]]
     assert torch.equal(image_of([*good, point]), image_of(good))
     assert not image_of([point]).any(), "alone they are an empty cloud"
+
+
+@pytest.mark.parametrize("intensity", [math.nan, math.inf, -math.inf])
+def test_an_intensity_not_finite_counts_as_zero(intensity: float) -> None:
+    assert torch.equal(image_of([[0.5, 1, 0, intensity]]), image_of([[0.5, 1, 0, 0]]))
+    assert image_of([[0.5, 1, 0, intensity]]).any(), "the point is there"
 
 
 def test_clouds_of_a_batch_do_not_mix_and_may_be_empty() -> None:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +25,7 @@ class PerceptionOutput:
     """What one agent sees in one frame, in its LiDAR's frame, but raised where the sensor stands unusually high or low.
 
     Attributes:
-        points: (N, 4) float32 x, y, z [m], intensity: the cloud itself, raised.
+        points: (N, 4) float32 x, y, z [m], intensity: the cloud's measurements, raised.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
         boxes: detections good enough to be tracked, with `track_id`: what the agent tells others. Each faces the way
             that most detections of its track did; the rest is as it was seen now.
@@ -33,6 +34,7 @@ class PerceptionOutput:
         seconds: time spent in each stage [s].
         raised: what was added to z [m] (`needed_raise`): 0 for a sensor on the roof of a car. Points and boxes of all
             agents have the ground at the same height so.
+        dropped: how many points of the cloud were no measurements, and left out (`check_points`).
     """
 
     points: Float32Array
@@ -42,6 +44,7 @@ class PerceptionOutput:
     detections: Boxes
     seconds: dict[str, float]
     raised: float = 0.0
+    dropped: int = 0
 
 
 class Perception:
@@ -77,6 +80,7 @@ class Perception:
             ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
         """
         checked = check_points(points)
+        dropped = len(np.asarray(points)) - len(checked)
         raised = needed_raise(checked)
         checked = lifted(checked, raised)
         seconds: dict[str, float] = {}
@@ -98,7 +102,7 @@ class Perception:
             yaw[good] = tracked.yaw
             detections = detections.replace(yaw=yaw)
         features = (first[0], second[0], third[0])
-        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised)
+        return PerceptionOutput(checked, features, tracked, variance[good], detections, seconds, raised, dropped)
 
     @contextmanager
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:

@@ -46,7 +46,8 @@ class PillarEncoder(nn.Module):
         """The pseudo-image of `clouds` clouds.
 
         Args:
-            points: (M, 4) x, y, z [m], intensity, of all clouds. What is out of range or not finite is dropped.
+            points: (M, 4) x, y, z [m], intensity, of all clouds. Points out of range, or with x, y or z not
+                finite, are dropped; an intensity that is not finite counts as 0.
             cloud: (M,) integers, the cloud that each point is from.
             clouds: how many there are, B; any may be empty.
 
@@ -62,7 +63,9 @@ class PillarEncoder(nn.Module):
         rows, columns, channels = self.config.rows, self.config.columns, self.config.pillar_channels
         xy = (points[:, :2] - self.low[:2]) / self.config.pillar
         z = points[:, 2]
-        inside = torch.isfinite(points).all(dim=1) & (xy >= 0).all(dim=1) & (xy[:, 0] < columns) & (xy[:, 1] < rows)
+        inside = (
+            torch.isfinite(points[:, :3]).all(dim=1) & (xy >= 0).all(dim=1) & (xy[:, 0] < columns) & (xy[:, 1] < rows)
+        )
         inside &= (z >= self.low[2]) & (z < self.high[2])
         points, xy, cloud = points[inside], xy[inside].floor(), cloud[inside]
         pillar = (cloud * rows + xy[:, 1].long()) * columns + xy[:, 0].long()
@@ -94,7 +97,7 @@ class PillarEncoder(nn.Module):
             from_center / size * 2,
         ]
         if self.config.use_intensity:
-            parts.append(points[:, 3:4])
+            parts.append(points[:, 3:4].nan_to_num(0.0, 0.0, 0.0))
         return torch.cat(parts, 1)
 
 

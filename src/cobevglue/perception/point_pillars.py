@@ -74,7 +74,7 @@ class PointPillars(nn.Module):
     def encode(self, clouds: Sequence[Tensor]) -> Tensor:
         """B clouds (N_i, 4) x, y, z [m], intensity, as a pseudo-image (B, pillar_channels, rows, columns).
 
-        Points out of range or not finite are dropped; a cloud may be empty.
+        Points out of range, or with x, y or z not finite, are dropped; a cloud may be empty.
         """
         points, cloud = batch_clouds([c.to(self.device, torch.float32, non_blocking=True) for c in clouds])
         image: Tensor = self.pillars(points, cloud, len(clouds))
@@ -106,8 +106,9 @@ class PointPillars(nn.Module):
         """The vehicles in one cloud.
 
         Args:
-            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped. A cloud of a sensor
-                that stands much higher or lower than on a car is looked at as if it did not (`needed_raise`).
+            points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Points that are no measurements are
+                dropped (`check_points`). A cloud of a sensor that stands much higher or lower than on a car is looked
+                at as if it did not (`needed_raise`).
 
         Returns:
             Boxes in the LiDAR's frame, best first, with score and label.
@@ -238,7 +239,14 @@ class _BehindPillars(nn.Module):
 
 
 def check_points(points: ArrayLike) -> Float32Array:
-    """A point cloud (N, 4) in float32.
+    """The points of a cloud that are measurements, (M, 4) in float32, in their order.
+
+    Left out are points at exactly (0, 0, 0), which is how several drivers report a pulse without a return, and points
+    with x, y or z that is not finite. An intensity that is not finite becomes 0: the point is a measurement all the
+    same, and the networks that ship do not look at intensity.
+
+    Args:
+        points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame.
 
     Raises:
         ValueError: not numbers, or of another shape; says what it is instead.
@@ -254,4 +262,8 @@ def check_points(points: ArrayLike) -> Float32Array:
     if array.ndim != 2 or array.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4): x, y, z [m], intensity; got {array.shape}")
     with np.errstate(over="ignore"):  # what is too large for float32 is out of range too
-        return np.ascontiguousarray(array, dtype=np.float32)
+        cloud = np.array(array, dtype=np.float32, order="C")
+    cloud[~np.isfinite(cloud[:, 3]), 3] = 0.0
+    xyz = cloud[:, :3]
+    measured: Float32Array = cloud[np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)]
+    return measured
