@@ -68,6 +68,34 @@ def test_after_a_reset_time_and_tracks_start_again(trained: PointPillars) -> Non
     perception.step(cloud_of(OBJECTS), time=1.0)
 
 
+@pytest.mark.parametrize(
+    ("point", "why"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], "a pulse without a return, as several drivers report it"),
+        ([0.0, 0.0, 0.0, 0.7], "the same with an intensity"),
+        ([np.nan, 1.0, 0.0, 0.0], "no x"),
+        ([1.0, 1.0, np.inf, 0.0], "no z"),
+    ],
+)
+def test_points_that_are_no_measurements_are_counted(trained: PointPillars, point: list[float], why: str) -> None:
+    cloud = cloud_of(OBJECTS)
+    expected = Perception(trained).step(cloud)
+    out = Perception(trained).step(np.concatenate([cloud, np.tile(np.array(point, np.float32), (500, 1))]))
+    assert (expected.dropped_points, out.dropped_points) == (0, 500), why
+    np.testing.assert_array_equal(out.points, expected.points, why)
+    np.testing.assert_array_equal(out.detections.bev, expected.detections.bev, why)
+
+
+def test_a_cloud_without_intensity_is_seen_whole(trained: PointPillars) -> None:
+    cloud = cloud_of(OBJECTS)
+    expected = Perception(trained).step(cloud)
+    cloud[:, 3] = np.nan
+    out = Perception(trained).step(cloud)
+    assert len(out.boxes) == len(expected.boxes) > 0
+    assert out.dropped_points == 0
+    np.testing.assert_array_equal(out.detections.bev, expected.detections.bev)
+
+
 def test_an_empty_frame_is_a_frame(trained: PointPillars) -> None:
     out = Perception(trained, min_track_score=0.5).step(np.zeros((0, 4)))
     assert len(out.boxes) == 0

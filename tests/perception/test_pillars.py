@@ -22,7 +22,7 @@ CONFIG = PointPillarsConfig(x_range=(-3.2, 3.2), y_range=(0.0, 3.2), pillar_chan
 def encoder(training: bool = False) -> PillarEncoder:
     torch.manual_seed(1)
     pillars = PillarEncoder(CONFIG)
-    pillars.norm.running_mean = torch.randn(5)
+    pillars.norm.running_mean = torch.randn(16)
     return pillars.train(training)
 
 
@@ -34,7 +34,7 @@ def image_of(*clouds: ArrayLike, pillars: PillarEncoder | None = None) -> torch.
 
 def naive(cloud: np.ndarray, pillars: PillarEncoder) -> torch.Tensor:
     """As the paper says it, pillar by pillar and point by point."""
-    image = torch.zeros(5, 8, 16)
+    image = torch.zeros(16, 8, 16)
     groups: dict[tuple[int, int], list[np.ndarray]] = {}
     for point in cloud.astype(np.float64):
         if np.isfinite(point).all() and -3.2 <= point[0] < 3.2 and 0 <= point[1] < 3.2 and -3 <= point[2] < 1:
@@ -90,6 +90,12 @@ def test_points_out_of_range_or_not_finite_change_nothing(point: list[float]) ->
     assert not image_of([point]).any(), "alone they are an empty cloud"
 
 
+@pytest.mark.parametrize("intensity", [math.nan, math.inf, -math.inf])
+def test_an_intensity_not_finite_counts_as_zero(intensity: float) -> None:
+    assert torch.equal(image_of([[0.5, 1, 0, intensity]]), image_of([[0.5, 1, 0, 0]]))
+    assert image_of([[0.5, 1, 0, intensity]]).any(), "the point is there"
+
+
 def test_clouds_of_a_batch_do_not_mix_and_may_be_empty() -> None:
     a, b = np.random.default_rng(0).uniform(-1, 3, (2, 50, 4))
     image = image_of(a, np.zeros((0, 4)), b)
@@ -106,7 +112,7 @@ def test_training_on_empty_clouds_works(clouds: list[np.ndarray]) -> None:
 def test_gradients_are_those_of_a_loop() -> None:
     cloud = np.random.default_rng(1).uniform(-1, 3, (40, 4))
     gradients = []
-    weight = torch.randn(5, 8, 16)
+    weight = torch.randn(16, 8, 16)
     for image in (lambda p: image_of(cloud, pillars=p)[0], lambda p: naive(cloud, p)):
         pillars = encoder()
         (image(pillars) * weight).sum().backward()  # type: ignore[no-untyped-call]

@@ -74,31 +74,6 @@ def test_bad_points_are_named(detector: PointPillars, points: Any, message: str)
         detector.detect(points)
 
 
-@pytest.mark.parametrize(
-    ("rows", "same"),
-    [
-        (np.zeros((300, 4)), True),  # missing returns, as several drivers store them
-        (np.full((300, 4), np.nan), True),
-        (np.tile([0.0, 0.0, -1.0, 0.0], (300, 1)), False),  # below the sensor, but a point
-    ],
-)
-def test_missing_returns_are_dropped_and_counted(trained: PointPillars, rows: np.ndarray, same: bool) -> None:
-    from cobevglue.perception import Perception
-
-    out = Perception(trained).step(np.vstack([CLOUD, rows]))
-    assert out.dropped_points == len(rows) * same
-    assert len(out.points) == len(CLOUD) + len(rows) * (not same)
-    if same:
-        np.testing.assert_array_equal(trained.detect(np.vstack([CLOUD, rows])).bev, trained.detect(CLOUD).bev)
-
-
-def test_nan_intensity_does_not_matter(trained: PointPillars) -> None:
-    cloud = CLOUD.copy()
-    cloud[:, 3] = np.nan
-    assert len(trained.detect(cloud)) > 0
-    np.testing.assert_array_equal(trained.detect(cloud).bev, trained.detect(CLOUD).bev)
-
-
 def test_rows_with_nan_and_the_order_of_points_do_not_matter(trained: PointPillars) -> None:
     shuffled = np.random.default_rng(0).permutation(np.vstack([CLOUD, np.full((50, 4), np.nan)]))
     assert np.allclose(trained.detect(shuffled).bev, trained.detect(CLOUD).bev, atol=1e-3)

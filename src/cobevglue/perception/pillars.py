@@ -46,8 +46,8 @@ class PillarEncoder(nn.Module):
         """The pseudo-image of `clouds` clouds.
 
         Args:
-            points: (M, 4) x, y, z [m], intensity, of all clouds. Points out of range are dropped, as are
-                those with a coordinate (or an intensity that is used) that is not finite.
+            points: (M, 4) x, y, z [m], intensity, of all clouds. Points out of range, or with a coordinate
+                that is not finite, are dropped; an intensity that is not finite counts as 0.
             cloud: (M,) integers, the cloud that each point is from.
             clouds: how many there are, B; any may be empty.
 
@@ -64,10 +64,7 @@ class PillarEncoder(nn.Module):
         xy = (points[:, :2] - self.low[:2]) / self.config.pillar
         z = points[:, 2]
         inside = (
-            torch.isfinite(points[:, : 3 + self.config.use_intensity]).all(dim=1)
-            & (xy >= 0).all(dim=1)
-            & (xy[:, 0] < columns)
-            & (xy[:, 1] < rows)
+            torch.isfinite(points[:, :3]).all(dim=1) & (xy >= 0).all(dim=1) & (xy[:, 0] < columns) & (xy[:, 1] < rows)
         )
         inside &= (z >= self.low[2]) & (z < self.high[2])
         points, xy, cloud = points[inside], xy[inside].floor(), cloud[inside]
@@ -100,7 +97,7 @@ class PillarEncoder(nn.Module):
             from_center / size * 2,
         ]
         if self.config.use_intensity:
-            parts.append(points[:, 3:4])
+            parts.append(points[:, 3:4].nan_to_num(0.0, 0.0, 0.0))
         return torch.cat(parts, 1)
 
 

@@ -241,7 +241,7 @@ def check_points(points: ArrayLike) -> Float32Array:
     """The valid returns of a point cloud, in float32.
 
     Dropped are points with a coordinate that is not finite, and points at exactly (0, 0, 0), as which several LiDAR
-    drivers store missing returns. The intensity may be NaN: no network uses it by default.
+    drivers store missing returns. An intensity that is not finite becomes 0.
 
     Args:
         points: (N, 4) x, y, z [m], intensity, in the LiDAR frame.
@@ -263,6 +263,7 @@ def check_points(points: ArrayLike) -> Float32Array:
     if array.ndim != 2 or array.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4): x, y, z [m], intensity; got {array.shape}")
     with np.errstate(over="ignore"):  # what is too large for float32 is out of range too
-        cloud = np.ascontiguousarray(array, dtype=np.float32)
-    valid = np.isfinite(cloud[:, :3]).all(axis=1) & cloud[:, :3].any(axis=1)
-    return cloud if valid.all() else cloud[valid]
+        cloud = np.array(array, dtype=np.float32, order="C")
+    cloud[~np.isfinite(cloud[:, 3]), 3] = 0.0
+    valid: Float32Array = cloud[np.isfinite(cloud[:, :3]).all(axis=1) & (cloud[:, :3] != 0.0).any(axis=1)]
+    return valid

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.perception import AnchorGrid, PointPillarsConfig, TargetBatch, Targets, assign_targets, collate_targets
+from cobevglue.perception.point_pillars import check_points
 from cobevglue.training.augmentation import AugmentationConfig, augment
 from cobevglue.typing import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -76,6 +77,7 @@ class Batches:
 
     def prepare(self, sample: LabelledCloud, random: np.random.Generator) -> Item:
         """The sample, augmented and cropped, with targets."""
+        sample = replace(sample, points=check_points(sample.points))  # as the detector does when it is used
         if self._augmentation is not None:
             sample = augment(sample, self._augmentation, random)
         boxes, points = sample.boxes, sample.points
