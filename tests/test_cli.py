@@ -323,7 +323,7 @@ def test_bench_times_every_step(
         assert "backbone" in out
         return
     report = json.loads(out)
-    assert report["message_bytes"] == {"5": 28 + 5 * 32, "8": 28 + 8 * 32}
+    assert report["message_bytes"] == {"5": 44 + 5 * 32, "8": 44 + 8 * 32}
     stages = report["perception"]["stages"]
     assert list(stages) == ["load", "pillars", "backbone", "head", "boxes", "heading", "tracking", "all"]
     assert all(0 < timed["best_ms"] <= timed["median_ms"] for timed in stages.values())

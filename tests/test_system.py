@@ -211,6 +211,19 @@ def test_given_localisation_is_the_relative_pose_of_the_claims() -> None:
     assert out.message_bytes["b"]["pose"] == out.alignment_bytes["b"]
 
 
+def test_nothing_fused_needs_no_poses() -> None:
+    detector = small_detector()
+    system = CoBEVGlue(detector, method("none", detector), group_aligner("given"))
+    clouds = {"a": cloud(1), "b": cloud(2)}
+    out = system.step(clouds, "a")
+    assert not out.alignments["b"].accepted
+    assert out.alignments["b"].reason == "no poses are given, and nothing is fused"
+    assert out.alignment_bytes == {"b": 0}
+    system.reset()
+    told = system.step(clouds, "a", poses={"a": np.eye(4), "b": pose(5.0, 0.0, 0.5)})
+    np.testing.assert_array_equal(out.boxes.bev, told.boxes.bev)
+
+
 def test_agents_come_and_go_and_another_ego_starts_afresh() -> None:
     detector = small_detector()
     system = CoBEVGlue(detector, method("cobevglue", detector), group_aligner("bevglue"))

@@ -20,6 +20,7 @@ from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.fusion import FusionMethod, Received, pretrained_fusion
 from cobevglue.fusion.heading import vote_headings
+from cobevglue.fusion.none import NoCollaboration
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars
 from cobevglue.typing import ArrayLike, FloatArray
@@ -99,7 +100,8 @@ class CoBEVGlue:
             points: (N, 4) x, y, z [m], intensity of every agent's cloud, each in its own LiDAR frame.
             ego: the agent whose view is asked for.
             time: of the clouds [s]; by default 0.1 s after the last.
-            poses: (4, 4) world_SE3_lidar of every agent as its localisation claims, for aligners that need one.
+            poses: (4, 4) world_SE3_lidar of every agent as its localisation claims, for aligners that need one; may be
+                left out with fusion "none", which needs none: all others are then refused.
 
         Raises:
             ValueError: no such ego, a cloud or pose of a wrong shape, or `time` not later than the last; names the
@@ -136,8 +138,13 @@ class CoBEVGlue:
         sent: dict[str, dict[str, int]] = {agent: {"boxes": 0, "features": 0} for agent in seen if agent != ego}
 
         with _timed("alignment", spent):
-            observations = self._observe(seen, ego, time, poses, sent)
-            alignments = self.aligner.align_group(ego, observations, time)  # (1b)
+            if poses is None and "pose" in self.aligner.needs and isinstance(self.fusion, NoCollaboration):
+                observations = {agent: Observation() for agent in seen}
+                refused = Alignment.refused("no poses are given, and nothing is fused")
+                alignments = {agent: refused for agent in seen if agent != ego}
+            else:
+                observations = self._observe(seen, ego, time, poses, sent)
+                alignments = self.aligner.align_group(ego, observations, time)  # (1b)
         alignment_bytes = {agent: sum(parts.values()) for agent, parts in sent.items()}
 
         with _timed("messages", spent):

@@ -27,6 +27,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 
 from cobevglue.boxes import Boxes
+from cobevglue.clock import Clock
 from cobevglue.se2 import SE2, wrap_angle
 from cobevglue.settings import Settings
 from cobevglue.typing import BoolArray, FloatArray, IntArray
@@ -129,7 +130,7 @@ class Sort:
 
     def reset(self) -> None:
         """Forget all tracks, the frame's motion and the time. Identities go on counting."""
-        self._time: float | None = None
+        self._clock = Clock(self.config.period)
         self._tracks = _State()
         self._frame = _FrameMotion(self.config)
 
@@ -149,16 +150,16 @@ class Sort:
             The N boxes with `track_id`.
 
         Raises:
-            ValueError: `time` is not finite or not later than the last one, or `heading_confidence` is not one
-                number in [0, 1] for each box; the tracker is then unchanged.
+            ValueError: `time` is not finite, not in seconds or not later than the last one, or `heading_confidence` is
+                not one number in [0, 1] for each box; the tracker is then unchanged.
         """
         votes = np.ones(len(boxes)) if heading_confidence is None else np.asarray(heading_confidence, dtype=np.float64)
-        n = len(boxes)
-        if votes.shape != (n,) or not ((votes >= 0.0) & (votes <= 1.0)).all():
+        if votes.shape != (len(boxes),) or not ((votes >= 0.0) & (votes <= 1.0)).all():
             raise ValueError(
                 f"heading_confidence must be {len(boxes)} numbers in [0, 1], got shape {votes.shape}: {votes}"
             )
-        time, dt = self._advance(time)
+        dt = self._clock.advance(time)
+        time = self._now
         self._end_lost_tracks(time)
         self._predict(dt)
         rows, columns = self._associate(boxes, dt)
@@ -190,23 +191,17 @@ class Sort:
         s = self._tracks
         center = np.column_stack([s.position.real, s.position.imag, s.shape[:, 3]])
         boxes = Boxes(center, s.shape[:, :3], wrap_angle(s.yaw), track_id=s.id)
-        return Tracks(boxes, np.column_stack([s.velocity.real, s.velocity.imag]), (self._time or 0.0) - s.seen)
+        return Tracks(boxes, np.column_stack([s.velocity.real, s.velocity.imag]), self._now - s.seen)
 
     @property
     def now_SE2_before(self) -> SE2:
         """The frame's own motion over the last step: where a point at rest, given as seen before, is seen now."""
         return SE2(self._frame.shift.real, self._frame.shift.imag, self._frame.yaw)
 
-    def _advance(self, time: float | None) -> tuple[float, float]:
-        """The time of this update and the step since the last one [s]."""
-        if time is None:
-            time = 0.0 if self._time is None else self._time + self.config.period
-        time = float(time)
-        if not math.isfinite(time) or (self._time is not None and time <= self._time):
-            raise ValueError(f"time must be finite and later than the last update's {self._time}, got {time}")
-        dt = self.config.period if self._time is None else time - self._time
-        self._time = time
-        return time, dt
+    @property
+    def _now(self) -> float:
+        """Time of the last update [s]."""
+        return self._clock.time or 0.0
 
     def _end_lost_tracks(self, time: float) -> None:
         """Death: unseen for too long."""

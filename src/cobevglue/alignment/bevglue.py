@@ -13,6 +13,7 @@ from cobevglue.alignment.config import BEVGlueConfig
 from cobevglue.alignment.object_graph import ObjectGraph
 from cobevglue.alignment.procrustes import procrustes
 from cobevglue.boxes import Boxes
+from cobevglue.clock import Clock
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray, IntArray
 
@@ -40,7 +41,7 @@ class BEVGlue:
         self._matcher = (
             _PaperMatcher(self.config) if self.config.method == "affinity" else _EvidenceMatcher(self.config)
         )
-        self._time: float | None = None
+        self._clock = Clock(_FRAME)
 
     def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
         """The relative pose in this frame, or a refusal with its reason.
@@ -51,7 +52,7 @@ class BEVGlue:
             time: when both were seen [s], on any clock; 0.1 s after the last call by default.
 
         Raises:
-            ValueError: `time` is not finite or not later than the last call's.
+            ValueError: `time` is not finite, not in seconds or not later than the last call's.
             TypeError: a list is no `Boxes`.
         """
         for name, boxes in (("ego", ego), ("other", other)):
@@ -61,23 +62,17 @@ class BEVGlue:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._time = None
+        self._clock.reset()
         self._matcher.reset()
 
     def _advance_clock(self, time: float | None) -> float:
         """Seconds since the last call; after a gap that is too long everything is forgotten."""
-        last = self._time
-        if time is None:
-            time = 0.0 if last is None else last + _FRAME
-        if not math.isfinite(time):
-            raise ValueError(f"time must be finite, got {time}")
-        if last is not None and time <= last:
-            raise ValueError(f"time must be later than the last call's {last} s, got {time} s (reset() starts anew)")
-        if last is not None and time - last > self.config.max_gap:
+        first = self._clock.time is None
+        step = self._clock.advance(time)
+        if not first and step > self.config.max_gap:
             self._matcher.reset()
-            last = None
-        self._time = time
-        return _FRAME if last is None else time - last
+            return _FRAME
+        return step
 
 
 class _PaperMatcher:

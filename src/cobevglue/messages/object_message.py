@@ -1,24 +1,29 @@
 """The message an agent sends in each frame: eight numbers an object, as in the paper, behind a small header.
 
-Layout of version 1, little endian throughout, A = length of the agent id in bytes, N = number of objects:
+Layout of version 2, little endian throughout, A = length of the agent id in bytes, N = number of objects:
 
-| offset   | bytes | type    | content                                                                        |
-|----------|-------|---------|--------------------------------------------------------------------------------|
-| 0        | 4     | bytes   | magic, `CBVG`                                                                  |
-| 4        | 1     | uint8   | version, 1                                                                     |
-| 5        | 1     | uint8   | A, 1 to 64                                                                     |
-| 6        | 2     | uint16  | N, 0 to 4096                                                                   |
-| 8        | 4     | uint32  | frame: the sender's frame count                                                |
-| 12       | 8     | float64 | time stamp [s]                                                                 |
-| 20       | A     | UTF-8   | agent id, printable characters                                                 |
-| 20+A     | 32 N  | float32 | per object x, y, z, l, w, h [m], yaw [rad] in the sender's frame, and track id |
-| 20+A+32N | 4     | uint32  | CRC-32 (zlib's) of all bytes before it                                         |
+| offset   | bytes | type    | content                                                                     |
+|----------|-------|---------|-----------------------------------------------------------------------------|
+| 0        | 4     | bytes   | magic, `CBVG`                                                               |
+| 4        | 1     | uint8   | version, 2                                                                  |
+| 5        | 1     | uint8   | A, 1 to 64                                                                  |
+| 6        | 2     | uint16  | N, 0 to 4096                                                                |
+| 8        | 4     | uint32  | frame: the sender's frame count                                             |
+| 12       | 8     | float64 | time stamp [s]                                                              |
+| 20       | 16    | float64 | origin x, y [m] of the objects in the sender's frame                        |
+| 36       | A     | UTF-8   | agent id, printable characters                                              |
+| 36+A     | 32 N  | float32 | per object x, y from the origin, z, l, w, h [m], yaw [rad], and track id    |
+| 36+A+32N | 4     | uint32  | CRC-32 (zlib's) of all bytes before it                                      |
 
+Version 1 has no origin: the agent id is at offset 20, and x and y are in the sender's frame. It is read, not written.
+
+- float32 is exact to 0.5 mm up to 16 km only, and a northing in UTM is 5,000 km: hence the origin. It is the median
+  position, rounded to multiples of 1,024 m, and so 0 in the frame of a vehicle. A coordinate that arrives more than
+  1 mm off all the same is an error.
 - Scores and labels are not sent: the paper sends eight numbers an object, and alignment needs no others.
 - Track ids are whole numbers from 0 to 2^24, which float32 holds exactly. Boxes without track ids carry -1 in every
   row; -1 in only some rows is an error. A message without objects decodes to boxes without track ids.
 - A yaw outside [-pi, pi] is wrapped into it before it is rounded to float32, so that large angles lose nothing.
-- float32 rounds a coordinate of 100 m by at most 4 micrometres.
 - The CRC finds corruption (every single flipped bit among it), not forgery: a message is not authenticated.
 
 The length of these bytes is the communication volume of the boxes that is reported everywhere.
@@ -35,7 +40,7 @@ import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import wrap_angle
-from cobevglue.typing import Float32Array, IntArray
+from cobevglue.typing import Float32Array, FloatArray, IntArray
 
 __all__ = [
     "BYTES_PER_OBJECT",
@@ -50,10 +55,10 @@ __all__ = [
     "encoded_size",
 ]
 
-VERSION = 1
-"""The only layout written and read."""
+VERSION = 2
+"""The layout that is written; version 1 is read, too."""
 MAX_OBJECTS = 4096
-"""Most objects in one message: far above any scene, and it bounds a message at 131,160 bytes."""
+"""Most objects in one message: far above any scene, and it bounds a message at 131,176 bytes."""
 MAX_AGENT_ID_BYTES = 64
 """Longest agent id, in bytes of its UTF-8 form."""
 MAX_TRACK_ID = 2**24
@@ -65,6 +70,9 @@ BYTES_PER_OBJECT = 32
 
 _MAGIC = b"CBVG"
 _HEADER = struct.Struct("<4sBBHId")
+_ORIGIN = struct.Struct("<2d")
+_ORIGIN_GRID = 1024.0  # origins are multiples of it [m]
+_TOLERANCE = 1e-3  # of a position after the round trip [m]
 _CHECKSUM = struct.Struct("<I")
 _NO_TRACK_ID = -1
 _LARGEST_YAW = np.float32(np.pi)  # a little above pi: what the angles next to pi round to
@@ -117,24 +125,33 @@ def encoded_size(n_objects: int, agent_id: str) -> int:
     """
     if not 0 <= n_objects <= MAX_OBJECTS:
         raise MessageError(f"n_objects must be from 0 to {MAX_OBJECTS}, got {n_objects}")
-    return _HEADER.size + len(_agent_id_bytes(agent_id)) + BYTES_PER_OBJECT * n_objects + _CHECKSUM.size
+    return _size(VERSION, len(_agent_id_bytes(agent_id)), n_objects)
 
 
 def encode(message: ObjectMessage) -> bytes:
     """The bytes of a message, in the layout that this module's docstring describes.
 
     Raises:
-        MessageError: a track id is negative or above 2^24, or a number does not survive as float32 (names field and
-            row). What is encoded always decodes.
+        MessageError: a track id is negative or above 2^24, a position would arrive more than 1 mm off (the objects
+            spread over more than 16 km), or a size does not survive as float32; names field and row. What is encoded
+            always decodes.
     """
     agent_id = _agent_id_bytes(message.agent_id)
-    table = _table_of(message.boxes)
+    origin = _origin_of(message.boxes)
+    table = _table_of(message.boxes, origin)
     try:
-        _boxes_of(table)  # a size may round to zero, a coordinate to infinity: the receiver would have to refuse them
+        arrived = _boxes_of(table, origin)  # a size may round to zero, a coordinate to infinity: to be refused here
     except ValueError as error:
         raise MessageError(f"boxes do not fit float32: {error}") from None
+    error_m = np.abs(arrived.center - message.boxes.center).max(axis=1, initial=0.0)
+    if (error_m > _TOLERANCE).any():
+        row = int(error_m.argmax())
+        raise MessageError(
+            f"boxes do not fit float32: center: row {row} is {message.boxes.center[row].tolist()}, too far from the "
+            f"other objects around {origin.tolist()}: it would arrive {error_m[row]:.2g} m off"
+        )
     header = _HEADER.pack(_MAGIC, VERSION, len(agent_id), len(message.boxes), message.frame, message.time)
-    body = header + agent_id + table.tobytes()
+    body = header + _ORIGIN.pack(*origin) + agent_id + table.tobytes()
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
@@ -147,22 +164,22 @@ def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
     if not isinstance(data, (bytes, bytearray, memoryview)):
         raise MessageError(f"a message is bytes, got {type(data).__name__}")
     data = bytes(data)
-    smallest = encoded_size(0, "?")
+    smallest = _size(1, 1, 0)
     if len(data) < smallest:
         raise MessageError(f"truncated: {len(data)} bytes, a message has at least {smallest}")
     magic, version, id_length, n_objects, frame, time = _HEADER.unpack_from(data)
     if magic != _MAGIC:
         raise MessageError(f"not an object message: it starts with {magic!r} instead of {_MAGIC!r}")
-    if version != VERSION:
-        raise MessageError(f"unknown version {version}, only version {VERSION} can be read")
+    if not 1 <= version <= VERSION:
+        raise MessageError(f"unknown version {version}, only versions 1 to {VERSION} can be read")
     if not 1 <= id_length <= MAX_AGENT_ID_BYTES or n_objects > MAX_OBJECTS:
         raise MessageError(
             f"corrupted: the header has an agent id of {id_length} bytes (1 to {MAX_AGENT_ID_BYTES}) and {n_objects} "
             f"objects (at most {MAX_OBJECTS})"
         )
-    objects_start = _HEADER.size + id_length
-    objects_end = objects_start + BYTES_PER_OBJECT * n_objects
-    expected = objects_end + _CHECKSUM.size
+    expected = _size(version, id_length, n_objects)
+    objects_end = expected - _CHECKSUM.size
+    objects_start = objects_end - BYTES_PER_OBJECT * n_objects
     if len(data) != expected:
         what = "truncated" if len(data) < expected else "oversized"
         raise MessageError(f"{what}: {len(data)} bytes, the header ({n_objects} objects) announces {expected}")
@@ -170,15 +187,24 @@ def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
         raise MessageError("corrupted: the checksum does not match")
     # From here on the bytes are as they were sent, and only a sender's mistake can be wrong with them.
     try:
-        agent_id = data[_HEADER.size : objects_start].decode("utf-8")
+        agent_id = data[objects_start - id_length : objects_start].decode("utf-8")
     except UnicodeDecodeError as error:
         raise MessageError(f"agent_id is not UTF-8: {error}") from None
     table = np.frombuffer(data, dtype="<f4", count=8 * n_objects, offset=objects_start).reshape(n_objects, 8)
+    origin = np.array(_ORIGIN.unpack_from(data, _HEADER.size) if version > 1 else (0.0, 0.0))
+    if not np.isfinite(origin).all():
+        raise MessageError(f"origin must be finite, got {origin.tolist()}")
     try:
-        boxes = _boxes_of(table)
+        boxes = _boxes_of(table, origin)
     except ValueError as error:
         raise MessageError(f"invalid boxes: {error}") from None
     return ObjectMessage(agent_id=agent_id, time=time, frame=frame, boxes=boxes)
+
+
+def _size(version: int, id_length: int, n_objects: int) -> int:
+    """Bytes of a message of this version."""
+    header = _HEADER.size + (_ORIGIN.size if version > 1 else 0)
+    return header + id_length + BYTES_PER_OBJECT * n_objects + _CHECKSUM.size
 
 
 def _agent_id_bytes(agent_id: str) -> bytes:
@@ -193,11 +219,21 @@ def _agent_id_bytes(agent_id: str) -> bytes:
     return encoded
 
 
-def _table_of(boxes: Boxes) -> Float32Array:
-    """(N, 8) little-endian float32: x, y, z, l, w, h, yaw, track id."""
+def _origin_of(boxes: Boxes) -> FloatArray:
+    """(2,) median x, y [m], which one far object does not move, on a grid: the sender's own origin if that is near."""
+    if not len(boxes):
+        return np.zeros(2)
+    median = np.sort(boxes.center[:, :2], axis=0)[(len(boxes) - 1) // 2]
+    origin: FloatArray = np.round(median / _ORIGIN_GRID) * _ORIGIN_GRID + 0.0  # no negative zeros
+    return origin
+
+
+def _table_of(boxes: Boxes, origin: FloatArray) -> Float32Array:
+    """(N, 8) little-endian float32: x and y from the origin, z, l, w, h, yaw, track id."""
     table = np.empty((len(boxes), 8), dtype="<f4")
     with np.errstate(over="ignore", under="ignore"):  # what overflows or vanishes is refused by name afterwards
-        table[:, 0:3] = boxes.center
+        table[:, 0:2] = boxes.center[:, :2] - origin
+        table[:, 2] = boxes.center[:, 2]
         table[:, 3:6] = boxes.size
         yaw = boxes.yaw.astype("<f4")
         table[:, 6] = np.where(np.abs(yaw) <= _LARGEST_YAW, yaw, wrap_angle(boxes.yaw))
@@ -216,10 +252,11 @@ def _sendable(track_id: IntArray) -> IntArray:
     return track_id
 
 
-def _boxes_of(sent: Float32Array) -> Boxes:
+def _boxes_of(sent: Float32Array, origin: FloatArray) -> Boxes:
     """The boxes of an (N, 8) table; ValueError with field and row where they are not valid."""
     with np.errstate(invalid="ignore"):  # a signalling NaN would warn here; Boxes refuses it by name
         table = sent.astype(np.float64)
+    table[:, 0:2] += origin
     track_id = table[:, 7]
     absent = track_id == _NO_TRACK_ID
     if not absent.all():
