@@ -13,6 +13,7 @@ from cobevglue.experiments.study import StudySettings
 from cobevglue.experiments.table import Table
 from cobevglue.experiments.tables import Experiment, Scope
 from cobevglue.experiments.tables.summary import summary
+from cobevglue.relative_paths import without_absolute_paths
 
 __all__ = ["Part", "write_report"]
 
@@ -44,7 +45,7 @@ def write_report(
         experiments: what is reported, in order.
         scope: what was run.
         parts: the data sets.
-        about: command, versions, machine and date, a line each.
+        about: command, versions, machine and date, a line each. Absolute paths in them become relative.
 
     Returns:
         The tables of each data set by its name, and the summary under "".
@@ -54,7 +55,7 @@ def write_report(
 
     folder = Path(folder)
     tables: dict[str, list[Table]] = {"": [summary(scope, {part.settings.label: part.results for part in parts})]}
-    about = [*about, *(line for part in parts for line in _data(part))]
+    about = [without_absolute_paths(line) for line in (*about, *(line for part in parts for line in _data(part)))]
     sections = [Section("In short", "\n\n".join(about), tables[""], _of(parts, ""))]
     markdown = [f"# {_TITLE}", "", *(f"- {line}" for line in about), "", *(t.to_markdown() for t in tables[""])]
     for experiment in experiments:

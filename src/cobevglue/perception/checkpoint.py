@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from cobevglue.datasets.whole_files import whole_file
+from cobevglue.relative_paths import without_absolute_paths
 
 __all__ = ["Checkpoint", "fingerprint", "load_checkpoint", "load_weights", "save_checkpoint"]
 
@@ -50,7 +51,7 @@ def save_checkpoint(
         architecture: name of the kind of network, checked when loading.
         config: its settings, as JSON can hold them.
         module: the network.
-        metadata: what else is known: data, metrics, seed; as JSON can hold it.
+        metadata: what else is known: data, metrics, seed; as JSON can hold it. Absolute paths in it become relative.
         half: weights in float16, for half the size; statistics of the normalisation stay float32.
     """
     weights = {}
@@ -61,7 +62,7 @@ def save_checkpoint(
         _MAGIC: _FORMAT,
         "architecture": architecture,
         "config": json.dumps(config),
-        "metadata": json.dumps(dict(metadata or {})),
+        "metadata": json.dumps(without_absolute_paths(dict(metadata or {}))),
     }
     with whole_file(Path(path)) as partial:
         save_file(weights, partial, header)
