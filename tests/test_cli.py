@@ -75,6 +75,7 @@ USAGE_ERRORS = [
     (["--nosuch"], "--nosuch"),
     (["align", "--nosuch"], "--nosuch"),
     (["align"], "Missing argument"),
+    (["align", "-1/000070.yaml", "b.json"], "a path that begins with a dash as ./-1/…"),
     (["align", "a.json", "b.json", "c.json"], "c.json"),
     (["demo", "--seed", "-1"], "--seed"),
     (["demo", "--seed", "x"], "--seed"),

@@ -52,6 +52,15 @@ def test_a_row_can_be_set_off() -> None:
     assert "<tr><td>a</td><td>1</td></tr>" in html
 
 
+def test_only_long_cells_are_broken_into_lines(tmp_path: Path) -> None:
+    html = table(["name", "value"], [["a", "0.841"], ["b", "word " * 20]])
+    assert "<td>0.841</td>" in html
+    assert f'<td class="text">{"word " * 20}</td>' in html
+    assert (
+        "td.text { white-space: normal;" in write_page(tmp_path / "page.html", "T", "", [Part("P", html)]).read_text()
+    )
+
+
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row 1 has 1 cells, the table has 2 columns"):
         table(["a", "b"], [["1", "2"], ["3"]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -93,6 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _usage_message(error: Exception) -> str:
     """One line: what is wrong, and where help is."""
     message = " ".join(str(getattr(error, "format_message", error.__str__)()).split())
+    if re.search(r"No such option: -\d", message):  # roadside units of data sets have negative ids
+        message = f"{message.rstrip('.')}; write a path that begins with a dash as ./-1/…"
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "cobevglue"
     return f"{message.rstrip('.')}; see '{command} --help'"

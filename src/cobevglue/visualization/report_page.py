@@ -36,6 +36,7 @@ table { border-collapse: collapse; margin: 0.6rem 0; font-variant-numeric: tabul
 th, td { padding: 0.45rem 1.1rem 0.45rem 0; text-align: right; white-space: nowrap;
          border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { text-align: left; }
+td.text { white-space: normal; min-width: 14rem; max-width: 30rem; overflow-wrap: break-word; }
 th { font-weight: 600; border-bottom: 2px solid var(--text); vertical-align: bottom; white-space: normal; }
 tr.strong td { font-weight: 700; color: var(--good); }
 .scroll { overflow-x: auto; }
@@ -46,6 +47,10 @@ figcaption { max-width: 60rem; margin-top: 0.4rem; color: var(--faint); font-siz
 footer { margin-top: 3rem; padding-top: 0.8rem; border-top: 1px solid var(--line); color: var(--faint);
          font-size: 0.9rem; }
 """
+
+
+_LONG_CELL = 36
+"""Cells of more characters are broken into lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +97,17 @@ def table(
         if len(row) != len(header):
             raise ValueError(f"row {number} has {len(row)} cells, the table has {len(header)} columns")
         start = '<tr class="strong">' if number in strong else "<tr>"
-        lines.append(f"{start}{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
+        lines.append(f"{start}{''.join(map(_cell, row))}</tr>")
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     below = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f'<div class="scroll">{body}</div>' + (f'<ul class="notes">{below}</ul>' if below else "")
+
+
+def _cell(text: str) -> str:
+    """A cell of a table's body; only long text is broken into lines, so that numbers and names stay in one."""
+    start = '<td class="text">' if len(text) > _LONG_CELL else "<td>"
+    return f"{start}{escape(text)}</td>"
 
 
 def figure(png: bytes, caption: str = "", text: str = "") -> str:
