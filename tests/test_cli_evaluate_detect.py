@@ -177,3 +177,19 @@ def test_alignment_refuses_what_is_for_detection(
 ) -> None:
     assert main(["evaluate", "--root", str(simulated), *arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("dataset", "option", "message"),
+    [
+        ("dair-v2x", "label=original", "no option 'label'; did you mean 'labels'"),
+        ("v2v4real", "left_handed", "must be KEY=VALUE"),
+        ("opv2v", "labels=original", "opv2v: no option 'labels'; there are none"),
+    ],
+)
+def test_a_bad_dataset_option_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], dataset: str, option: str, message: str
+) -> None:
+    words = ["evaluate", "--task", "detect", "--dataset", dataset, "--root", str(tmp_path), "--dataset-option", option]
+    assert main(words) == 2
+    assert message in capsys.readouterr().err

@@ -14,7 +14,7 @@ from pypcd4.pypcd4 import Encoding, PointCloud
 from scipy.spatial.transform import Rotation
 
 from cobevglue import Boxes
-from cobevglue.datasets import DAIRV2X, transform_boxes
+from cobevglue.datasets import DAIRV2X, open_dataset, transform_boxes
 from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.se2 import wrap_angle
 from cobevglue.typing import FloatArray
@@ -191,7 +191,8 @@ def test_a_release_without_complemented_labels_is_not_taken_for_one(root: Path) 
     shutil.rmtree(root / "cooperative/label_world_backup")
     with pytest.raises(FileNotFoundError, match=r"original labels.*labels='original'"):
         DAIRV2X(root, "val")
-    assert len(DAIRV2X(root, "val", labels="original")["34"][0].ground_truth("vehicle")) == 2
+    opened = open_dataset("dair-v2x", root, "val", {"labels": "original"})
+    assert len(opened["34"][0].ground_truth("vehicle")) == 2
     with pytest.raises(ValueError, match="no labels 'new'"):
         DAIRV2X(root, "val", labels="new")  # type: ignore[arg-type]
 
@@ -357,3 +358,25 @@ def test_broken_corners_and_missing_or_garbled_files_are_named(root: Path) -> No
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"label_world/015438\.json is not there"):
         frame.ground_truth("vehicle")
+
+
+@pytest.mark.parametrize("where", ["in place", "inside the root", "beside the root"])
+@pytest.mark.parametrize("ending", ["pcd", "bin"])
+def test_clouds_are_found_where_archives_unpack_them(tmp_path: Path, where: str, ending: str) -> None:
+    from cobevglue.datasets.dair_v2x import _cloud_folders, _points
+    from cobevglue.datasets.pcd import write_pcd_intensity
+
+    side = tmp_path / "cooperative-vehicle-infrastructure" / "vehicle-side"
+    archive = "cooperative-vehicle-infrastructure-vehicle-side-velodyne"
+    folders = {"in place": side / "velodyne", "inside the root": side.parent / archive}
+    folder = folders.get(where, tmp_path / archive)
+    folder.mkdir(parents=True)
+    cloud = np.array([[1, 2, 3, 1], [4, 5, 6, 0]], np.float32)
+    if ending == "pcd":
+        write_pcd_intensity(folder / "000001.pcd", cloud)
+    else:
+        (cloud * np.array([1, 1, 1, 255], np.float32)).tofile(folder / "000001.bin")
+    points = _points(_cloud_folders(side), "000001")
+    assert points is not None
+    np.testing.assert_allclose(points, cloud)
+    assert _points(_cloud_folders(side), "000002") is None

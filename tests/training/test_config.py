@@ -36,6 +36,20 @@ def test_a_single_value_is_changed(change: str, where: str, value: object) -> No
     assert found == value
 
 
+@pytest.mark.parametrize(
+    ("changes", "splits"),
+    [
+        ([], ("train", "validation")),  # the simulator's
+        (["data.source=v2xset"], ("train", "validate")),
+        (["data.source=dair-v2x"], ("train", "val")),
+        (["data.source=opv2v", "data.split=test", "data.validation_split=mine"], ("test", "mine")),
+    ],
+)
+def test_splits_are_named_as_in_the_data_set(changes: list[str], splits: tuple[str, str]) -> None:
+    data = load_config("compact", changes).data
+    assert (data.split_name(validation=False), data.split_name(validation=True)) == splits
+
+
 def test_a_file_overrides_its_preset_and_changes_override_both(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("preset: tiny\nseed: 3\noptimisation: {epochs: 9, clip: 2}\n")

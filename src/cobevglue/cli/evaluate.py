@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from cobevglue.cli.dataset_options import DatasetOptions, parse_dataset_options
 from cobevglue.cli.errors import InputError
 from cobevglue.cli.evaluate_align import evaluate_align
 from cobevglue.cli.evaluate_detect import DetectTask, evaluate_detect
@@ -34,7 +35,7 @@ class Dataset(str, Enum):
 
 _ONLY_FOR = {
     Task.ALIGN: ("max_range", "perfect", "paper"),
-    Task.DETECT: ("weights", "reach", "min_points", "scenario", "frames", "picture", "failures"),
+    Task.DETECT: ("weights", "reach", "min_points", "scenario", "frames", "picture", "failures", "dataset_option"),
 }
 """Options that one task knows and the other does not."""
 
@@ -45,6 +46,7 @@ def evaluate(
     task: Annotated[Task, typer.Option(help="What to evaluate.")] = Task.ALIGN,
     dataset: Annotated[Dataset, typer.Option(help="Format of the data set.")] = Dataset.OPV2V,
     split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
+    dataset_option: DatasetOptions = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the detection errors, or of simulated worlds.")] = 0,
     max_range: Annotated[
         float, typer.Option(min=1.0, help="align: objects farther away are not detected, in metres.")
@@ -83,9 +85,21 @@ def evaluate(
     both of its dialects, and what is wrong with the boxes found.
     """
     _refuse_options_of_others(context, task)
+    options = parse_dataset_options(dataset_option)
     if task is Task.DETECT:
         wanted = DetectTask(
-            root, dataset.value, split, weights, reach, min_points, scenario, frames, seed, picture, failures
+            root,
+            dataset.value,
+            split,
+            weights,
+            reach,
+            min_points,
+            scenario,
+            frames,
+            seed,
+            picture,
+            failures,
+            options,
         )
         evaluate_detect(wanted, as_json)
         return

@@ -7,10 +7,10 @@ import dataclasses
 import math
 import statistics
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cobevglue.cli.errors import InputError, expected_errors
 from cobevglue.cli.output import print_json, print_note, print_table
@@ -48,6 +48,7 @@ class DetectTask:
         seed: of simulated worlds.
         pictures: folder for pictures, or None.
         failures: file for a list of what was missed and made up, or None.
+        options: further arguments of the data set's class.
     """
 
     root: Path | None
@@ -61,6 +62,7 @@ class DetectTask:
     seed: int
     pictures: Path | None
     failures: Path | None
+    options: Mapping[str, Any]
 
     @property
     def data(self) -> str:
@@ -130,7 +132,7 @@ def _evaluation_range(task: DetectTask, detector: PointPillars) -> EvaluationRan
 
 def _clouds(task: DetectTask) -> Iterator[Cloud]:
     """The clouds of the data set, or simulated ones."""
-    from cobevglue.datasets import DATASETS
+    from cobevglue.datasets import open_dataset
     from cobevglue.evaluation.detection_data import dataset_clouds, simulated_clouds
 
     if task.dataset == SIMULATED:
@@ -143,7 +145,7 @@ def _clouds(task: DetectTask) -> Iterator[Cloud]:
         return simulated_clouds(SimulatedEpisodes(task.split, task.seed), task.frames or _SIMULATED_CLOUDS)
     if task.root is None:
         raise InputError(f"--dataset {task.dataset} needs --root, the folder of the data set")
-    dataset = DATASETS[task.dataset](task.root, task.split)
+    dataset = open_dataset(task.dataset, task.root, task.split, task.options)
     return dataset_clouds(dataset if task.scenario is None else [dataset[task.scenario]])
 
 

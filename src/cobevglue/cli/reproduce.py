@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cobevglue.cli.dataset_options import DatasetOptions, parse_dataset_options
 from cobevglue.cli.errors import InputError, expected_errors
 from cobevglue.cli.output import print_json, print_note, print_table
 
@@ -39,6 +40,7 @@ def reproduce(
     real: Annotated[
         Path | None, typer.Option(help="Root of OPV2V, whose split test_culvercity is reported beside the other data.")
     ] = None,
+    dataset_option: DatasetOptions = None,
     out: Annotated[Path, typer.Option(help="Folder of the report; an interrupted run goes on in it.")] = Path("report"),
     tables: Annotated[
         str | None,
@@ -89,6 +91,7 @@ def reproduce(
         from cobevglue.fusion import fusion_class
     except ImportError as error:
         raise InputError(" ".join(str(error).split())) from error
+    options = parse_dataset_options(dataset_option)
     names = list(EXPERIMENTS) if tables is None else [name.strip() for name in tables.split(",")]
     common: dict[str, Any] = {
         "scenarios": scenarios or (_QUICK_DRIVES if quick else None),
@@ -98,7 +101,9 @@ def reproduce(
         "weights": None if weights is None else str(weights),
         "untrained": untrained,
     }
-    studies = [StudySettings(dataset=dataset, root=None if root is None else str(root), split=split, **common)]
+    studies = [
+        StudySettings(dataset=dataset, root=None if root is None else str(root), split=split, reader=options, **common)
+    ]
     if real is not None:
         # Not all of its drives have clouds: those without are no reason to look at fewer.
         studies.append(

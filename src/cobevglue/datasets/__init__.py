@@ -8,6 +8,11 @@
 Everything is right-handed (x forward, y left, z up) whatever the files are, and read when it is used.
 """
 
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
 from cobevglue.datasets.dair_v2x import DAIRV2X
 from cobevglue.datasets.dair_v2x_writer import (
     DAIRPair,
@@ -15,7 +20,7 @@ from cobevglue.datasets.dair_v2x_writer import (
     write_dair_v2x_frame,
     write_dair_v2x_index,
 )
-from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario
+from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario, did_you_mean
 from cobevglue.datasets.opv2v import OPV2V, V2XSet
 from cobevglue.datasets.opv2v_writer import write_opv2v_frame
 from cobevglue.datasets.pcd import read_pcd
@@ -38,6 +43,7 @@ __all__ = [
     "Scenario",
     "V2V4Real",
     "V2XSet",
+    "open_dataset",
     "read_pcd",
     "transform_boxes",
     "write_dair_v2x_frame",
@@ -45,3 +51,25 @@ __all__ = [
     "write_opv2v_frame",
     "write_v2v4real_frame",
 ]
+
+
+def open_dataset(name: str, root: str | Path, split: str, options: Mapping[str, Any] | None = None) -> Dataset:
+    """A split of the data set of this name.
+
+    Args:
+        name: a name in `DATASETS`.
+        root: its folder.
+        split: name of the split.
+        options: further arguments of its class: `labels` of DAIR-V2X, `left_handed` of V2V4Real.
+
+    Raises:
+        ValueError: no such data set, option or split; names the nearest.
+        FileNotFoundError: it is not there; says what was looked for.
+    """
+    if name not in DATASETS:
+        raise ValueError(f"no data set {did_you_mean(name, DATASETS)}")
+    known = [key for key in inspect.signature(DATASETS[name]).parameters if key not in ("root", "split")]
+    for key in options or {}:
+        if key not in known:
+            raise ValueError(f"{name}: no option {did_you_mean(key, known)}")
+    return DATASETS[name](root, split, **(options or {}))

@@ -13,16 +13,16 @@ Traps that are handled here:
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario, did_you_mean
-from cobevglue.datasets.pcd import read_pcd
+from cobevglue.datasets.pcd import read_bin, read_pcd
 from cobevglue.datasets.poses import inverse_SE3, rigid_SE3
 from cobevglue.typing import Float32Array, FloatArray
 
@@ -38,6 +38,8 @@ class DAIRV2X(Dataset):
     A scenario is a batch, one uncut recording of the car, and a frame a pair of clouds some ten milliseconds apart;
     `Frame.time` is that of the car's cloud. A frame is named by the id of the car's files.
     """
+
+    validation_split: ClassVar[str] = "val"
 
     def __init__(
         self,
@@ -103,11 +105,11 @@ class DAIRV2X(Dataset):
                 agents={
                     "vehicle": AgentFrame(
                         read_labels=partial(_vehicle, car, pair.vehicle, car_labels, self.classes),
-                        read_points=partial(_points, car / "velodyne" / f"{pair.vehicle}.pcd"),
+                        read_points=partial(_points, _cloud_folders(car), pair.vehicle),
                     ),
                     "infrastructure": AgentFrame(
                         read_labels=partial(_infrastructure, unit, pair, unit_labels, self.classes),
-                        read_points=partial(_points, unit / "velodyne" / f"{pair.infrastructure}.pcd"),
+                        read_points=partial(_points, _cloud_folders(unit), pair.infrastructure),
                         is_infrastructure=True,
                     ),
                 },
@@ -138,7 +140,7 @@ def _label_folders(root: Path, labels: str) -> tuple[Path, Path]:
     if labels == "complemented" and not all(renamed):
         raise FileNotFoundError(
             f"DAIRV2X: no {backup[1]}, so {plain[1]} are the original labels; complemented labels are put there after "
-            "renaming these to *_backup (or pass labels='original')"
+            "renaming these to *_backup (or pass labels='original', as --dataset-option labels=original to a command)"
         )
     return (backup[0], backup[1]) if labels == "original" and all(renamed) else plain
 
@@ -193,8 +195,20 @@ def _frame_id(path: Path, row: int, entry: Mapping[str, Any], field: str) -> str
     return Path(value).stem
 
 
-def _points(path: Path) -> Float32Array | None:
-    return read_pcd(path, intensity_scale=1.0 / 255.0) if path.is_file() else None
+def _cloud_folders(side: Path) -> tuple[Path, ...]:
+    """Where the clouds of a side may be: in place, or as the published archives unpack, inside or beside the root."""
+    archive = f"cooperative-vehicle-infrastructure-{side.name}-velodyne"
+    return side / "velodyne", side.parent / archive, side.parent.parent / archive
+
+
+def _points(folders: Iterable[Path], frame: str) -> Float32Array | None:
+    """The cloud of a frame, PCD or KITTI's .bin, from the first folder that has it; None if none does."""
+    for folder in folders:
+        if (folder / f"{frame}.pcd").is_file():
+            return read_pcd(folder / f"{frame}.pcd", intensity_scale=1.0 / 255.0)
+        if (folder / f"{frame}.bin").is_file():
+            return read_bin(folder / f"{frame}.bin", intensity_scale=1.0 / 255.0)
+    return None
 
 
 def _vehicle(side: Path, frame: str, labels: Path, classes: Collection[str]) -> tuple[FloatArray, Boxes]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import overload
+from typing import ClassVar, overload
 
 import numpy as np
 
@@ -155,8 +155,12 @@ class Dataset(ABC):
 
     Attributes:
         scenarios: names of the scenarios, sorted.
+        training_split: name of the split to train on.
+        validation_split: name of the split to validate on.
     """
 
+    training_split: ClassVar[str] = "train"
+    validation_split: ClassVar[str] = "validate"
     scenarios: tuple[str, ...]
 
     @abstractmethod

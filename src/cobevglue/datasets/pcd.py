@@ -14,7 +14,7 @@ import numpy as np
 from cobevglue.datasets.whole_files import whole_file
 from cobevglue.typing import ArrayLike, Float32Array
 
-__all__ = ["read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
+__all__ = ["read_bin", "read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
 
 
 def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
@@ -55,6 +55,36 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
             raise ValueError(f"{path}: the field 'rgb' must have 4 bytes, got {data.dtype['rgb'].itemsize}")
         packed = np.ascontiguousarray(data["rgb"]).view(np.uint32)
         points[:, 3] = ((packed >> 16) & 0xFF) / 255.0
+    return _finite(points)
+
+
+def read_bin(path: Path, intensity_scale: float = 1.0) -> Float32Array:
+    """Points of a file as KITTI stores clouds: x, y, z [m] and intensity of each point as little-endian float32.
+
+    Args:
+        path: the file.
+        intensity_scale: factor that brings the intensity to [0, 1].
+
+    Returns:
+        (N, 4) x, y, z [m], intensity in [0, 1], without points that have a coordinate that is not finite.
+
+    Raises:
+        FileNotFoundError: the file is not there.
+        ValueError: its size is no multiple of 16 bytes; names the file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is not there")
+    size = path.stat().st_size
+    if size % 16:
+        raise ValueError(f"{path}: {size} bytes are no whole number of points of 4 float32")
+    points = np.fromfile(path, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        points[:, 3] = np.clip(points[:, 3] * np.float32(intensity_scale), 0.0, 1.0)
+    return _finite(points)
+
+
+def _finite(points: Float32Array) -> Float32Array:
+    """The points whose coordinates are finite; an intensity that is not finite becomes 0."""
     points[~np.isfinite(points[:, 3]), 3] = 0.0
     return points[np.isfinite(points[:, :3]).all(axis=1)]
 

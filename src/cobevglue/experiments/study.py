@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from cobevglue.datasets import DATASETS
+from cobevglue.datasets import DATASETS, open_dataset
 from cobevglue.datasets.frame import Frame, Scenario, did_you_mean
 from cobevglue.settings import Settings
 
@@ -34,6 +33,7 @@ class StudySettings(Settings):
         dataset: name in `DATASETS`, or "simulated".
         root: of the data set; None for simulated drives.
         split: name of the split.
+        reader: further arguments of the data set's class (`open_dataset`).
         scenarios: so many at most; None for all, 24 of simulated ones.
         frames: of each scenario, from its beginning, so many at most; None for all, 20 of simulated ones.
         seed: of all that is random.
@@ -49,6 +49,7 @@ class StudySettings(Settings):
     dataset: str = SIMULATED
     root: str | None = None
     split: str = "test"
+    reader: dict[str, Any] = Field(default_factory=dict)
     scenarios: _Count | None = None
     frames: _Count | None = None
     seed: Annotated[int, Field(ge=0)] = SEED
@@ -79,7 +80,7 @@ def drive_names(settings: StudySettings) -> list[str]:
         raise ValueError(f"no data set {did_you_mean(settings.dataset, [SIMULATED, *DATASETS])}")
     if settings.root is None:
         raise ValueError(f"the data set {settings.dataset} needs a root, the folder where it is")
-    names = DATASETS[settings.dataset](Path(settings.root), settings.split).scenarios
+    names = open_dataset(settings.dataset, settings.root, settings.split, settings.reader).scenarios
     if not names:
         raise ValueError(f"{settings.root}: the split {settings.split!r} has no scenarios")
     return list(names[: settings.scenarios])
@@ -89,7 +90,7 @@ def open_drive(settings: StudySettings, number: int) -> Scenario:
     """Drive `number` of `drive_names`; nothing is read or simulated before a frame is used."""
     if settings.dataset == SIMULATED:
         return _simulated(settings, number)
-    dataset = DATASETS[settings.dataset](Path(settings.root or "."), settings.split)
+    dataset = open_dataset(settings.dataset, settings.root or ".", settings.split, settings.reader)
     return dataset[dataset.scenarios[number]]
 
 

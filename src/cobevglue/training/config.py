@@ -31,9 +31,10 @@ class DataConfig(Settings):
     Attributes:
         source: "simulated", or the name of a data set in `DATASETS`.
         root: folder of the data set.
-        split: what to train on.
-        validation_split: what to validate on.
+        split: what to train on; None for the source's own training split.
+        validation_split: what to validate on; None for the source's own validation split.
         options: further settings of the source: those of `EpisodeSettings`, or arguments of `DatasetEpisodes`.
+        reader: arguments of the data set's class, such as `labels` of DAIR-V2X or `left_handed` of V2V4Real.
         worlds: simulated worlds to train on, over and over; None for a new one each time.
         min_points: objects with fewer points are neither to be found nor wrong to find.
         pool: episodes whose samples are shuffled together, in each worker.
@@ -45,9 +46,10 @@ class DataConfig(Settings):
 
     source: str = SIMULATED
     root: Path | None = None
-    split: str = "train"
-    validation_split: str = "validation"
+    split: str | None = None
+    validation_split: str | None = None
     options: dict[str, Any] = Field(default_factory=dict)
+    reader: dict[str, Any] = Field(default_factory=dict)
     worlds: _Count | None = None
     min_points: Annotated[int, Field(ge=0)] = 5
     pool: _Count = 4
@@ -60,6 +62,16 @@ class DataConfig(Settings):
         if source not in (SIMULATED, *DATASETS):
             raise ValueError(f"no data {did_you_mean(source, (SIMULATED, *DATASETS))}")
         return source
+
+    def split_name(self, *, validation: bool) -> str:
+        """The split to train or validate on, the source's own where none is set."""
+        chosen = self.validation_split if validation else self.split
+        if chosen is not None:
+            return chosen
+        if self.source == SIMULATED:
+            return "validation" if validation else "train"
+        dataset = DATASETS[self.source]
+        return dataset.validation_split if validation else dataset.training_split
 
 
 class ValidationConfig(Settings):

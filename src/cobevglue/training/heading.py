@@ -168,7 +168,7 @@ def _examples(
     report: Callable[[str], None],
 ) -> HeadingExamples:
     """What the detector finds in the training or the validation split, on `device`."""
-    split = config.data.validation_split if measured else config.data.split
+    split = config.data.split_name(validation=measured)
     described = {
         **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "uses", "workers"}),
         "split": split,

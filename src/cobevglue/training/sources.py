@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cobevglue.datasets import DATASETS
+from cobevglue.datasets import open_dataset
 from cobevglue.datasets.labelled_cloud import LabelledCloud
 from cobevglue.training.config import SIMULATED, DataConfig
 from cobevglue.training.samples import DatasetEpisodes, EpisodeSource
@@ -37,7 +37,7 @@ def make_source(config: DataConfig, seed: int, *, validation: bool) -> EpisodeSo
         ValueError: no root, or no such split.
         FileNotFoundError: the data set is not there.
     """
-    split = config.validation_split if validation else config.split
+    split = config.split_name(validation=validation)
     seed = 0 if validation else seed
     if config.source == SIMULATED:
         from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
@@ -46,4 +46,5 @@ def make_source(config: DataConfig, seed: int, *, validation: bool) -> EpisodeSo
         return Repeated(simulated, config.worlds) if config.worlds is not None and not validation else simulated
     if config.root is None:
         raise ValueError(f"data.root: must be set for the data set {config.source}")
-    return DatasetEpisodes(DATASETS[config.source](config.root, split), seed, **config.options)
+    dataset = open_dataset(config.source, config.root, split, config.reader)
+    return DatasetEpisodes(dataset, seed, **config.options)
