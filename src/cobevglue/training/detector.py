@@ -11,13 +11,13 @@ from pathlib import Path
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
-from torch.utils.data import DataLoader
 
 from cobevglue.perception import DetectionLoss, PointPillars
 from cobevglue.torch_threads import torch_threads
 from cobevglue.training.batches import Batch, Batches
 from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
 from cobevglue.training.config import FREE_TO_CHANGE, TrainDetectorConfig
+from cobevglue.training.loader import batches
 from cobevglue.training.optimisation import Learner, autocast
 from cobevglue.training.processes import Processes, process_group
 from cobevglue.training.progress import EpochProgress
@@ -182,16 +182,13 @@ class _Run:
             processes=self.processes.count,
         )
         workers = config.data.workers
-        return iter(
-            DataLoader(
-                stream,
-                batch_size=optimisation.batch_size,
-                num_workers=workers,
-                collate_fn=ready.collate,
-                prefetch_factor=4 if workers else None,
-                pin_memory=self.processes.device.type == "cuda",
-                generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
-            )
+        return batches(
+            stream,
+            optimisation.batch_size,
+            workers,
+            ready.collate,
+            prefetch=4,
+            pin_memory=self.processes.device.type == "cuda",
         )
 
     def _train_epoch(self, batches: Iterator[Batch], log: RunLog) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from pydantic import Field
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.fusion import FUSION_METHODS, FusionSample, IntermediateFusion, fusion_class
@@ -26,6 +26,7 @@ from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, sa
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import TrainingResult
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
+from cobevglue.training.loader import batches
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
 from cobevglue.training.progress import EpochProgress
 from cobevglue.training.run_log import RunLog, print_progress
@@ -196,14 +197,7 @@ def _train_epoch(
     report: Callable[[str], None],
 ) -> None:
     optimisation = config.optimisation
-    loader = DataLoader(
-        samples,
-        batch_size=optimisation.batch_size,
-        num_workers=config.workers,
-        collate_fn=list,
-        prefetch_factor=2 if config.workers else None,
-        generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
-    )
+    loader = batches(samples, optimisation.batch_size, config.workers, list)
     progress = EpochProgress(optimisation, epoch, log, report, every=config.report_every, name=config.method)
     model = learner.model.train()
     anchors = len(model.anchors)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch.utils.data import DataLoader
 
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
 from cobevglue.perception import DetectionLoss, PointPillars
+from cobevglue.training import loader
 from cobevglue.training.batches import Batch, Batches
 from cobevglue.training.config import TrainDetectorConfig
 from cobevglue.training.optimisation import autocast
@@ -58,14 +58,7 @@ class Validation:
             batches.prepare,
             range(self._processes.rank, config.validation.episodes, self._processes.count),
         )
-        loader = DataLoader(
-            stream,
-            batch_size=config.optimisation.batch_size,
-            num_workers=config.data.workers,
-            collate_fn=batches.collate,
-            generator=torch.Generator(),  # see `_Run._batches`
-        )
-        return list(loader)
+        return list(loader.batches(stream, config.optimisation.batch_size, config.data.workers, batches.collate))
 
 
 def _summary(
