@@ -138,7 +138,10 @@ def test_real_clouds(culver_city: Path, weights: str, capsys: pytest.CaptureFixt
     [
         (["--root", "{root}", "--weights", "{labels}/none.safetensors"], "none.safetensors"),  # no such file
         (["--root", "{root}", "--weights", "compcat"], "compcat"),  # no such model
-        (["--root", "{labels}", "--weights", "{weights}"], "no clouds, only the labels of 24 frames"),  # labels only
+        (
+            ["--root", "{labels}", "--weights", "{weights}"],
+            "no clouds, only the labels of 24 frames of agents; looked for",
+        ),  # labels only
         (["--weights", "{weights}"], "needs --root"),  # a data set that is nowhere
         (["--dataset", "simulated", "--root", "{root}", "--weights", "{weights}"], "neither --root"),  # made up anyway
         (["--root", "{root}", "--scenario", "junction", "--weights", "{weights}"], "junction_0002"),  # no such scenario

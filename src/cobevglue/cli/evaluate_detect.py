@@ -103,7 +103,8 @@ def evaluate_detect(task: DetectTask, as_json: bool) -> None:
         )
     if not counts.clouds:
         raise InputError(
-            f"{task.root}: {task.data} has no clouds, only the labels of {counts.without_cloud} frames of agents"
+            f"{task.root}: {task.data} has no clouds, only the labels of {counts.without_cloud} frames of agents; "
+            f"looked for {_cloud_location(task)}"
         )
     if as_json:
         about = {"dataset": task.dataset, "split": task.split, "scenario": task.scenario, "weights": task.weights}
@@ -111,6 +112,13 @@ def evaluate_detect(task: DetectTask, as_json: bool) -> None:
         print_json({**about, **measured, **dataclasses.asdict(report)})
     else:
         _print_report(task, report, counts)
+
+
+def _cloud_location(task: DetectTask) -> str:
+    from cobevglue.datasets import open_dataset
+
+    assert task.root is not None  # simulated sequences have clouds
+    return open_dataset(task.dataset, task.root, task.split, task.options).cloud_location
 
 
 def _load_detector(weights: str) -> PointPillars:

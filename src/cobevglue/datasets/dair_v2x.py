@@ -90,6 +90,13 @@ class DAIRV2X(Dataset):
     def __repr__(self) -> str:
         return f"DAIRV2X({str(self.root)!r}, split={self.split!r})"
 
+    @property
+    def cloud_location(self) -> str:
+        """Where the files of the clouds are expected, for error messages."""
+        sides = self.root / "vehicle-side", self.root / "infrastructure-side"
+        folders = [folder for side in sides for folder in _cloud_folders(side)]
+        return "<frame>.pcd or .bin in " + ", ".join(map(str, folders))
+
     def _scenario(self, name: str) -> Scenario:
         pairs = self._batches[name]
 

@@ -167,6 +167,11 @@ class Dataset(ABC):
     def __init__(self, root: str | Path, split: str) -> None:
         """Look at which scenarios the split of this name has, in the data set kept at `root`."""
 
+    @property
+    def cloud_location(self) -> str:
+        """Where the files of the clouds are expected, for error messages."""
+        return f"the clouds of {self!r}"
+
     def __getitem__(self, name: str) -> Scenario:
         """The scenario of this name.
 

@@ -65,6 +65,11 @@ class YamlTree(Dataset):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}, split={self.split!r})"
 
+    @property
+    def cloud_location(self) -> str:
+        """Where the files of the clouds are expected, for error messages."""
+        return f"{self.root / self.split}/<scenario>/<agent>/<timestamp>.pcd"
+
     def _label_reader(self, agent: str) -> LabelReader:
         """What reads a yaml file of this agent."""
         raise NotImplementedError
