@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
-import yaml
 
 from cobevglue.cli.errors import InputError
 
@@ -28,6 +27,8 @@ def parse_dataset_options(texts: Sequence[str] | None) -> dict[str, Any]:
     Raises:
         InputError: a text is not KEY=VALUE.
     """
+    import yaml  # here: `--help` needs none
+
     options = {}
     for text in texts or ():
         key, equals, value = text.partition("=")
