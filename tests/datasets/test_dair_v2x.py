@@ -375,8 +375,32 @@ def test_clouds_are_found_where_archives_unpack_them(tmp_path: Path, where: str,
     if ending == "pcd":
         write_pcd_intensity(folder / "000001.pcd", cloud)
     else:
-        (cloud * np.array([1, 1, 1, 255], np.float32)).tofile(folder / "000001.bin")
+        cloud.tofile(folder / "000001.bin")
     points = _points(_cloud_folders(side), "000001")
     assert points is not None
     np.testing.assert_allclose(points, cloud)
     assert _points(_cloud_folders(side), "000002") is None
+
+
+def test_the_index_may_name_bin_files(root: Path) -> None:
+    """Trees whose clouds were converted to KITTI's format have the new names in their index files, too."""
+    for path in (root / "vehicle-side/data_info.json", root / "cooperative/data_info.json"):
+        path.write_text(path.read_text().replace(".pcd", ".bin"))
+    (root / "vehicle-side/velodyne").mkdir()
+    cloud = np.array([[1, 2, 3, 0.5]], dtype=np.float32)
+    cloud.tofile(root / "vehicle-side/velodyne/015438.bin")
+    points = DAIRV2X(root, "val")["34"][0].agents["vehicle"].points
+    assert points is not None
+    np.testing.assert_array_equal(points, cloud)
+
+
+def test_the_layout_of_spd_is_named(root: Path) -> None:
+    edit(root / "cooperative/data_info.json", lambda rows: (rows[0].clear(), rows[0].update(vehicle_frame="000001")))
+    with pytest.raises(ValueError, match=r"vehicle_frame .* V2X-Seq-SPD; only DAIR-V2X-C is read"):
+        DAIRV2X(root, "val")
+
+
+def test_json_with_a_byte_order_mark_is_read(root: Path) -> None:
+    path = root / "vehicle-side/label/lidar/015438.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(DAIRV2X(root, "val")["34"][0].agents["vehicle"].objects) == len(TRUTH)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pypcd4.pypcd4 import Encoding, PointCloud
 
 from cobevglue.datasets import read_pcd
-from cobevglue.datasets.pcd import write_pcd_rgb
+from cobevglue.datasets.pcd import read_bin, write_pcd_rgb
 
 POINTS = np.array([[1.5, -2.25, 0.125], [-30.0, 4.0, -1.75], [100.0, 0.0, 2.0]], dtype=np.float32)
 RED = np.array([0, 127, 255], dtype=np.uint32)
@@ -180,3 +180,25 @@ def test_fields_with_count_zero_or_none(tmp_path: Path, encoding: Encoding, coun
 def test_points_with_nan_intensity_are_kept(tmp_path: Path) -> None:
     path = save(tmp_path / "a.pcd", Encoding.BINARY, "intensity", np.array([np.nan, 0.5, 1.0], dtype=np.float32))
     np.testing.assert_array_equal(read_pcd(path)[:, 3], [0.0, 0.5, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("stored", "intensity"),
+    [
+        ([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]),  # KITTI's own, and what DAIR-V2X's converter writes
+        ([0.0, 51.0, 255.0], [0.0, 0.2, 1.0]),  # the sensor's numbers as they were
+        ([-0.1, np.nan, 1.0], [0.0, 0.0, 1.0]),  # what is no intensity is 0
+    ],
+)
+def test_intensities_of_bin_files(tmp_path: Path, stored: list[float], intensity: list[float]) -> None:
+    np.column_stack([POINTS, stored]).astype("<f4").tofile(tmp_path / "a.bin")
+    points = read_bin(tmp_path / "a.bin")
+    np.testing.assert_array_equal(points[:, :3], POINTS)
+    np.testing.assert_allclose(points[:, 3], intensity, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("content", "message"), [(b"", "is empty"), (b"0" * 20, "20 bytes are no whole number")])
+def test_cut_bin_files_are_named(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.bin").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"a\.bin: {message}"):
+        read_bin(tmp_path / "a.bin")

@@ -197,8 +197,12 @@ def _pairs(path: Path) -> list[_Pair]:
 
 def _frame_id(path: Path, row: int, entry: Mapping[str, Any], field: str) -> str:
     value = entry.get(field)
-    if not isinstance(value, str) or not value.endswith(".pcd"):
-        raise ValueError(f"{path}: [{row}].{field} must be the path of a pcd file, got {value!r}")
+    if value is None and "vehicle_frame" in entry:
+        raise ValueError(
+            f"{path}: [{row}] has vehicle_frame in place of {field}: this is V2X-Seq-SPD; only DAIR-V2X-C is read"
+        )
+    if not isinstance(value, str) or not value.endswith((".pcd", ".bin")):
+        raise ValueError(f"{path}: [{row}].{field} must be the path of a .pcd or .bin file, got {value!r}")
     return Path(value).stem
 
 
@@ -214,7 +218,7 @@ def _points(folders: Iterable[Path], frame: str) -> Float32Array | None:
         if (folder / f"{frame}.pcd").is_file():
             return read_pcd(folder / f"{frame}.pcd", intensity_scale=1.0 / 255.0)
         if (folder / f"{frame}.bin").is_file():
-            return read_bin(folder / f"{frame}.bin", intensity_scale=1.0 / 255.0)
+            return read_bin(folder / f"{frame}.bin")
     return None
 
 
@@ -336,7 +340,7 @@ def _read_list(path: Path) -> list[Mapping[str, Any]]:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # editors on Windows add a byte-order mark
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is not there") from None
     except (ValueError, RecursionError) as error:

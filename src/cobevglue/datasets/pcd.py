@@ -58,29 +58,35 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
     return _finite(points)
 
 
-def read_bin(path: Path, intensity_scale: float = 1.0) -> Float32Array:
+def read_bin(path: Path) -> Float32Array:
     """Points of a file as KITTI stores clouds: x, y, z [m] and intensity of each point as little-endian float32.
+
+    KITTI's intensities, and those that DAIR-V2X's converter writes, are in [0, 1]. Where the largest of a file is above
+    1, they are the sensor's own 0 to 255 and divided by 255.
 
     Args:
         path: the file.
-        intensity_scale: factor that brings the intensity to [0, 1].
 
     Returns:
         (N, 4) x, y, z [m], intensity in [0, 1], without points that have a coordinate that is not finite.
 
     Raises:
         FileNotFoundError: the file is not there.
-        ValueError: its size is no multiple of 16 bytes; names the file.
+        ValueError: it is empty, or its size is no multiple of 16 bytes; names the file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is not there")
     size = path.stat().st_size
+    if size == 0:
+        raise ValueError(f"{path}: is empty (0 bytes)")
     if size % 16:
         raise ValueError(f"{path}: {size} bytes are no whole number of points of 4 float32")
     points = np.fromfile(path, dtype="<f4").reshape(-1, 4).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        points[:, 3] = np.clip(points[:, 3] * np.float32(intensity_scale), 0.0, 1.0)
-    return _finite(points)
+    points = _finite(points)
+    if (points[:, 3] > 1.0).any():
+        points[:, 3] /= 255.0
+    points[:, 3] = np.clip(points[:, 3], 0.0, 1.0)
+    return points
 
 
 def _finite(points: Float32Array) -> Float32Array:
