@@ -145,6 +145,7 @@ def test_real_clouds(culver_city: Path, weights: str, capsys: pytest.CaptureFixt
         (["--weights", "{weights}"], "needs --root"),  # a data set that is nowhere
         (["--dataset", "simulated", "--root", "{root}", "--weights", "{weights}"], "neither --root"),  # made up anyway
         (["--root", "{root}", "--scenario", "junction", "--weights", "{weights}"], "junction_0002"),  # no such scenario
+        (["--dataset", "simulated", "--dataset-option", "labels=original", "--weights", "{weights}"], "no effect"),
         (["--root", "{root}", "--range", "0", "40", "--weights", "{weights}"], "range"),  # nothing is in this range
         (["--root", "{root}", "--perfect"], "--perfect is for --task align"),  # an option of the other task
     ],
@@ -188,11 +189,17 @@ def test_alignment_refuses_what_is_for_detection(
         ("dair-v2x", "label=original", "no option 'label'; did you mean 'labels'"),
         ("v2v4real", "left_handed", "must be KEY=VALUE"),
         ("opv2v", "labels=original", "opv2v: no option 'labels'; there are none"),
+        ("dair-v2x", "labels=[", "--dataset-option labels=[: the value is not readable as YAML"),
+        ("dair-v2x", "classes=car", "classes must be a list of types, like [car, bus], got 'car'"),
+        ("v2v4real", "left_handed=ture", "left_handed must be true or false, got 'ture'"),  # text is true in Python
     ],
 )
 def test_a_bad_dataset_option_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], dataset: str, option: str, message: str
 ) -> None:
+    (tmp_path / "test" / "scenario" / "0").mkdir(parents=True)
     words = ["evaluate", "--task", "detect", "--dataset", dataset, "--root", str(tmp_path), "--dataset-option", option]
     assert main(words) == 2
-    assert message in capsys.readouterr().err
+    captured = capsys.readouterr().err
+    assert message in captured
+    assert len(captured.splitlines()) == 1

@@ -267,8 +267,9 @@ def test_an_offset_may_be_a_string(root: Path) -> None:
     assert pose[0, 3] == pytest.approx(WORLD_UNIT_AS_CALIBRATED[0, 3] + 2)
 
 
-def test_other_classes_can_be_asked_for(root: Path) -> None:
-    objects = DAIRV2X(root, "val", classes=("pedestrian",))["34"][0].agents["vehicle"].objects
+@pytest.mark.parametrize("kind", ["pedestrian", "Pedestrian"])  # as in the files
+def test_other_classes_can_be_asked_for(root: Path, kind: str) -> None:
+    objects = DAIRV2X(root, "val", classes=(kind,))["34"][0].agents["vehicle"].objects
     np.testing.assert_array_equal(objects.label, ["pedestrian"])
 
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
 from cobevglue.cli import main
+from cobevglue.cli.app import app
+from cobevglue.cli.reproduce import _command
 
 from .tiny import write_agent
 
@@ -116,3 +120,17 @@ def test_real_clouds_go_through_the_shipped_detector(
     ours = dict(zip(ablation["columns"], ablation["rows"][4], strict=True))
     assert ours["refused"] <= 0.5
     assert ours["AP@0.5"] > rows["AP@0.5, no collaboration"]
+
+
+def test_the_recorded_command_repeats_repeated_options() -> None:
+    words = ["--quick", "--dataset-option", "labels=original", "--dataset-option", "split_file=my ids.json"]
+    command: Any = get_command(app)
+    context = command.commands["reproduce"].make_context("cobevglue reproduce", list(words))
+    recorded = "--dataset-option labels=original --dataset-option 'split_file=my ids.json'"
+    assert _command(context) == f"cobevglue reproduce --quick {recorded}"
+
+
+def test_reader_options_are_refused_for_simulated_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "--out", str(tmp_path), "--dataset-option", "labels=original"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "have no effect on simulated drives: {'labels': 'original'}" in line

@@ -6,10 +6,13 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from cobevglue import Boxes
 from cobevglue.datasets import AgentFrame, Dataset, Frame, Scenario
 from cobevglue.training import DatasetEpisodes
+from cobevglue.training.config import DataConfig
+from cobevglue.training.sources import make_source
 
 
 class Numbered(Dataset):
@@ -57,3 +60,8 @@ def test_an_episode_depends_on_seed_and_index_alone() -> None:
     source.episode(9)  # what was asked for before plays no part
     for a, b in zip(source.episode(1), copy.episode(1), strict=True):
         np.testing.assert_array_equal(a.points, b.points)
+
+
+def test_reader_options_are_refused_for_simulated_data() -> None:
+    with pytest.raises(ValueError, match=r"data\.reader: has no effect on simulated data"):
+        make_source(DataConfig(reader={"labels": "original"}), 0, validation=False)

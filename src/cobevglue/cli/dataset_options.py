@@ -25,7 +25,7 @@ def parse_dataset_options(texts: Sequence[str] | None) -> dict[str, Any]:
     """Values by their keys; each value is read as YAML.
 
     Raises:
-        InputError: a text is not KEY=VALUE.
+        InputError: a text is not KEY=VALUE, or its value is not YAML.
     """
     import yaml  # here: `--help` needs none
 
@@ -34,5 +34,8 @@ def parse_dataset_options(texts: Sequence[str] | None) -> dict[str, Any]:
         key, equals, value = text.partition("=")
         if not key or not equals:
             raise InputError(f"--dataset-option {text}: must be KEY=VALUE")
-        options[key] = yaml.safe_load(value)
+        try:
+            options[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise InputError(f"--dataset-option {text}: the value is not readable as YAML") from None
     return options

@@ -146,6 +146,8 @@ def _clouds(task: DetectTask) -> Iterator[Cloud]:
     if task.dataset == SIMULATED:
         if task.root is not None or task.scenario is not None:
             raise InputError("--dataset simulated has neither --root nor --scenario: its clouds are made on the way")
+        if task.options:
+            raise InputError("--dataset-option is for data sets that are read, and has no effect on simulated")
         try:
             from cobevglue.simulation.episodes import SimulatedEpisodes
         except ImportError as error:

@@ -173,7 +173,8 @@ def _command(context: typer.Context) -> str:
         source = context.get_parameter_source(parameter.name or "")
         if source is not None and source.name == "COMMANDLINE":
             value = context.params[parameter.name or ""]
-            words += [parameter.opts[0]] if value is True else [parameter.opts[0], str(value)]
+            values = value if isinstance(value, list | tuple) else [value]  # a repeated option is repeated
+            words += [parameter.opts[0]] if value is True else [w for v in values for w in (parameter.opts[0], str(v))]
     return f"{context.command_path} {shlex.join(words)}"
 
 

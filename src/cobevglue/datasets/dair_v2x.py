@@ -56,18 +56,21 @@ class DAIRV2X(Dataset):
             root: the folder `cooperative-vehicle-infrastructure`, or the one that holds it.
             split: name of the split.
             labels: "complemented" for the labels of Lu et al., "original" for those of the first release.
-            classes: lower-case types of objects to keep.
+            classes: types of objects to keep, in any case.
             split_file: JSON list of the car's frame ids, or the official `cooperative-split-data.json`. Left out:
                 `<split>.json` or that name, in `root` or next to it. Ids without a pair are passed over (the official
                 test part is not published).
 
         Raises:
             FileNotFoundError: something is not there; says what was looked for.
-            ValueError: no such split, or a file is broken; names it and the field.
+            ValueError: no such split or labels, `classes` is a text, or a file is broken; names it and the field.
         """
+        if isinstance(classes, str) or not isinstance(classes, Collection):
+            raise ValueError(f"DAIRV2X: classes must be a list of types, like [car, bus], got {classes!r}")
         given = Path(root)
         nested = given / "cooperative-vehicle-infrastructure"
-        self.root, self.split, self.classes = nested if nested.is_dir() else given, split, frozenset(classes)
+        self.root, self.split = nested if nested.is_dir() else given, split
+        self.classes = frozenset(str(kind).lower() for kind in classes)
         if not (self.root / "cooperative" / "data_info.json").is_file():
             raise FileNotFoundError(f"DAIRV2X: looked for {self.root / 'cooperative' / 'data_info.json'}")
         self._label_folders = _label_folders(self.root, labels)

@@ -49,9 +49,11 @@ class V2V4Real(YamlTree):
 
         Raises:
             FileNotFoundError: there is no such root, or the split is not in it; says what was looked for.
-            ValueError: no split is called so; names the nearest.
+            ValueError: no split is called so (names the nearest), or `left_handed` is not a bool.
         """
         super().__init__(root, split)
+        if not isinstance(left_handed, bool):  # it may be what a user typed, and any text is true
+            raise ValueError(f"{type(self).__name__}: left_handed must be true or false, got {left_handed!r}")
         self.left_handed = left_handed
 
     def _label_reader(self, agent: str) -> LabelReader:

@@ -75,6 +75,8 @@ def drive_names(settings: StudySettings) -> list[str]:
     if settings.dataset == SIMULATED:
         if settings.root is not None:
             raise ValueError("simulated drives have no root: they are made on the way")
+        if settings.reader:
+            raise ValueError(f"options of a data set's reader have no effect on simulated drives: {settings.reader}")
         return [_simulated(settings, number).name for number in range(settings.scenarios or _SIMULATED_DRIVES)]
     if settings.dataset not in DATASETS:
         raise ValueError(f"no data set {did_you_mean(settings.dataset, [SIMULATED, *DATASETS])}")

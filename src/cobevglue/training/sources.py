@@ -34,12 +34,14 @@ def make_source(config: DataConfig, seed: int, *, validation: bool) -> EpisodeSo
         validation: take the validation split.
 
     Raises:
-        ValueError: no root, or no such split.
+        ValueError: no root, no such split, or options of a reader for simulated data.
         FileNotFoundError: the data set is not there.
     """
     split = config.split_name(validation=validation)
     seed = 0 if validation else seed
     if config.source == SIMULATED:
+        if config.reader:
+            raise ValueError(f"data.reader: has no effect on simulated data, got {config.reader}")
         from cobevglue.simulation.episodes import EpisodeSettings, SimulatedEpisodes
 
         simulated = SimulatedEpisodes(split, seed, EpisodeSettings(**config.options))
