@@ -83,6 +83,34 @@ def test_one_document_counts_clouds_and_those_that_are_not_there(
     assert set(report["by_range"]) == {"0-30 m", "30-50 m", "50-100 m", ">= 100 m"}
 
 
+def test_clouds_without_labels_are_counted(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A calibration or label file that is not there costs one cloud, not the run; DAIR-V2X has such frames."""
+    (tmp_path / "vehicle-side/velodyne").mkdir(parents=True)
+    identity = {"rotation": np.eye(3).tolist(), "translation": [[0], [0], [0]]}
+    names = ("000001", "000002")
+    index = [{"pointcloud_path": f"velodyne/{name}.pcd", "pointcloud_timestamp": name} for name in names]
+    pairs = [{f"{side}_pointcloud_path": f"{name}.pcd" for side in ("vehicle", "infrastructure")} for name in names]
+    files: dict[str, object] = {"vehicle-side/data_info": index, "cooperative/data_info": pairs, "test": names}
+    for name in names:
+        np.array([[5, 0, 0, 1]], dtype="<f4").tofile(tmp_path / f"vehicle-side/velodyne/{name}.bin")
+        for calibration in ("novatel_to_world", "lidar_to_novatel"):
+            files[f"vehicle-side/calib/{calibration}/{name}"] = identity
+    files["vehicle-side/label/lidar/000002"] = []
+    for file, content in files.items():
+        path = tmp_path / f"{file}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content))
+    words = ["--dataset", "dair-v2x", "--root", str(tmp_path), "--dataset-option", "labels=original"]
+    assert evaluate(*words, "--weights", weights, "--json") == 0
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    assert [report[key] for key in ("frames", "without_cloud", "without_labels")] == [1, 2, 1]
+    assert "label/lidar/000001.json is not there; others like it are counted" in printed.err
+    (tmp_path / "vehicle-side/label/lidar/000002.json").unlink()
+    assert evaluate(*words, "--weights", weights) == 2
+    assert "none of the 2 clouds has labels: " in capsys.readouterr().err
+
+
 def test_the_table_says_its_range_and_has_both_dialects(
     simulated: Path, weights: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

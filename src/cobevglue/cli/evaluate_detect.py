@@ -72,9 +72,11 @@ class DetectTask:
 
 @dataclasses.dataclass
 class _Counts:
-    """What happened on the way: agents' frames without a cloud, and the time that each of the clouds took [s]."""
+    """What happened on the way: agents' frames without a cloud or labels, and the time that each cloud took [s]."""
 
     without_cloud: int = 0
+    without_labels: int = 0
+    missing_labels: str = ""  # the error of the first of them
     seconds: list[float] = dataclasses.field(default_factory=list)
 
     @property
@@ -101,6 +103,8 @@ def evaluate_detect(task: DetectTask, as_json: bool) -> None:
             min_points=task.min_points,
             score_threshold=_SCORE_THRESHOLD,
         )
+    if not counts.clouds and counts.without_labels:
+        raise InputError(f"none of the {counts.without_labels} clouds has labels: {counts.missing_labels}")
     if not counts.clouds:
         raise InputError(
             f"{task.root}: {task.data} has no clouds, only the labels of {counts.without_cloud} frames of agents; "
@@ -108,8 +112,9 @@ def evaluate_detect(task: DetectTask, as_json: bool) -> None:
         )
     if as_json:
         about = {"dataset": task.dataset, "split": task.split, "scenario": task.scenario, "weights": task.weights}
-        measured = {"without_cloud": counts.without_cloud, "median_milliseconds": counts.milliseconds}
-        print_json({**about, **measured, **dataclasses.asdict(report)})
+        left_out = {"without_cloud": counts.without_cloud, "without_labels": counts.without_labels}
+        measured = {"median_milliseconds": counts.milliseconds, **dataclasses.asdict(report)}
+        print_json({**about, **left_out, **measured})
     else:
         _print_report(task, report, counts)
 
@@ -173,6 +178,12 @@ def _detected(
     with ExitStack() as files:
         failures = _FailureFile(task, evaluation_range, files)
         for cloud in clouds:
+            if cloud.missing_labels is not None:
+                if not counts.without_labels:
+                    counts.missing_labels = cloud.missing_labels
+                    print_note(f"a cloud is left out: {cloud.missing_labels}; others like it are counted")
+                counts.without_labels += 1
+                continue
             if cloud.points is None:
                 counts.without_cloud += 1
                 continue
@@ -263,6 +274,7 @@ def _print_report(task: DetectTask, report: DetectionReport, counts: _Counts) ->
     print("AP sorts all detections by score; frame order is the dialect of OpenCOOD's released code.")
     print(f"Recall and precision: {sure}. {report.ignored_truth} objects were ignored.")
     none = f" {counts.without_cloud} frames of agents have no cloud." if counts.without_cloud else ""
+    none += f" {counts.without_labels} clouds have no labels." if counts.without_labels else ""
     print(f"{counts.milliseconds:.0f} ms per cloud (median).{none}")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -40,9 +40,10 @@ class Cloud:
     Attributes:
         frame: name of the frame, with that of its scenario.
         agent: name of the agent.
-        points: (N, 4) x, y, z [m], intensity; None where no cloud is stored.
-        truth: K boxes; none where there is no cloud.
+        points: (N, 4) x, y, z [m], intensity; None where no cloud is stored, or no labels for it.
+        truth: K boxes; none where `points` is None.
         point_count: (K,) points in each of them.
+        missing_labels: where a file of the labels or of their calibration is not there, the error that names it.
     """
 
     frame: str
@@ -50,10 +51,11 @@ class Cloud:
     points: Float32Array | None
     truth: Boxes
     point_count: IntArray
+    missing_labels: str | None = None
 
 
 def dataset_clouds(scenarios: Iterable[Scenario]) -> Iterator[Cloud]:
-    """Every agent of every frame, in order, with its own labels; also those without a cloud, to be counted.
+    """Every agent of every frame, in order, with its own labels; also those without a cloud or labels, to be counted.
 
     Args:
         scenarios: a split of a data set, or some of its scenarios.
@@ -65,10 +67,16 @@ def dataset_clouds(scenarios: Iterable[Scenario]) -> Iterator[Cloud]:
         for frame in scenario:
             for name, agent in frame.agents.items():
                 points, where = agent.points, f"{frame.scenario}/{frame.timestamp}"
+                nothing = Cloud(where, name, None, Boxes.empty(), np.zeros(0, dtype=np.int64))
                 if points is None:
-                    yield Cloud(where, name, None, Boxes.empty(), np.zeros(0, dtype=np.int64))
+                    yield nothing
+                    continue
+                try:
+                    objects = agent.objects
+                except FileNotFoundError as error:
+                    yield replace(nothing, missing_labels=str(error))
                 else:
-                    yield Cloud(where, name, points, agent.objects, count_points(points, agent.objects))
+                    yield Cloud(where, name, points, objects, count_points(points, objects))
 
 
 def simulated_clouds(source: Episodes, count: int) -> Iterator[Cloud]:
@@ -85,10 +93,10 @@ def detect(cloud: Cloud, detector: Detector) -> DetectionFrame:
     """What the detector finds in a cloud, next to the truth.
 
     Raises:
-        ValueError: the frame has no cloud.
+        ValueError: the frame has no cloud or no labels.
     """
     if cloud.points is None:
-        raise ValueError(f"{cloud.frame}: {cloud.agent}: no cloud is stored")
+        raise ValueError(f"{cloud.frame}: {cloud.agent}: {cloud.missing_labels or 'no cloud is stored'}")
     found = detector.detect(cloud.points)
     counts = count_points(cloud.points, found)
     return DetectionFrame(found, cloud.truth, cloud.point_count, cloud.frame, cloud.agent, counts)
