@@ -98,12 +98,12 @@ def read_v2v4real_labels_yaml(path: Path, agent: str, left_handed: bool = LEFT_H
 
 
 def _associations(path: Path, table: ObjectTable) -> list[int]:
-    """`ass_id` of each object. Without it an object that both agents observe would count as two."""
+    """`ass_id` of each object."""
     for own_id, entry in zip(table.ids, table.entries, strict=True):
         if "ass_id" not in entry:
             raise ValueError(
                 f"{path}: vehicles.{own_id} has no ass_id, the id that is common to both agents (-1: not associated); "
-                "read files of conversions whose own ids are common, such as RCooper's, with OPV2V's or add ass_id"
+                "without it an object that both observe would count as two"
             )
     return [entry["ass_id"] for entry in table.entries]
 
