@@ -70,3 +70,7 @@ def test_without_a_writable_folder_one_warning(package: Path) -> None:
 def test_all_kernel_files_are_hashed() -> None:
     files = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if "@kernel(" in path.read_text()}
     assert files == set(KERNEL_FILES)
+
+
+def test_kernels_run_uncompiled_for_debuggers(package: Path) -> None:
+    assert run(package, NUMBA_DISABLE_JIT="1").stdout == "6\n"

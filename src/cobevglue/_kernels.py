@@ -35,6 +35,8 @@ def kernel(error_model: Literal["python", "numpy"] = "python") -> Callable[[_Fun
 
     def compiled(function: _Function) -> _Function:
         dispatcher: Any = numba.njit(error_model=error_model)(function)
+        if dispatcher is function:  # NUMBA_DISABLE_JIT=1, for debuggers
+            return function
         try:
             dispatcher.enable_caching()
         except RuntimeError:  # numba found no writable folder
