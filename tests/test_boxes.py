@@ -117,7 +117,7 @@ def test_whole_floats_are_track_ids() -> None:
     assert as_lists(good(track_id=[1.0, 2.0, 3.0]))["track_id"] == [1, 2, 3]
 
 
-def test_the_arguments_are_copied_and_the_fields_are_read_only() -> None:
+def test_arguments_are_copied_and_fields_read_only() -> None:
     center = np.array(GOOD["center"], dtype=float)
     boxes = good(center=center)
     center[0, 0] = 99.0
@@ -132,7 +132,7 @@ def test_the_arguments_are_copied_and_the_fields_are_read_only() -> None:
 @pytest.mark.parametrize(
     "copied", [copy.copy, copy.deepcopy, lambda b: pickle.loads(pickle.dumps(b))], ids=["copy", "deepcopy", "pickle"]
 )
-def test_a_copy_has_the_same_content_and_is_read_only_too(copied: Any) -> None:
+def test_copy_is_equal_and_read_only(copied: Any) -> None:
     assert as_lists(copied(good())) == as_lists(good())
     assert not copied(good()).center.flags.writeable
 
@@ -166,18 +166,18 @@ def test_rows_are_taken_from_every_field(rows: Any, expected: list[float], why: 
         assert len(getattr(taken, name)) == len(expected), why
 
 
-def test_a_row_that_does_not_exist_is_an_index_error() -> None:
+def test_row_out_of_range_raises_index_error() -> None:
     with pytest.raises(IndexError):
         good()[3]
 
 
-def test_taking_a_row_twice_is_refused_while_there_are_ids() -> None:
+def test_repeated_row_with_ids_is_refused() -> None:
     with pytest.raises(ValueError, match="same id"):
         good()[[0, 0]]
     assert len(good(track_id=None)[[0, 0]]) == 2
 
 
-def test_replace_changes_only_what_is_named_and_validates_it() -> None:
+def test_replace_changes_named_fields_and_validates() -> None:
     assert as_lists(good().replace(score=None, yaw=[1, 1, 1])) == {**GOOD, "score": None, "yaw": [1, 1, 1]}
     with pytest.raises(ValueError, match="yaw: row 0"):
         good().replace(yaw=[math.nan, 0, 0])
@@ -194,21 +194,19 @@ def test_replace_changes_only_what_is_named_and_validates_it() -> None:
         ([good()[2], Boxes.empty(), good()[0]], [5, 1]),
     ],
 )
-def test_concatenate_keeps_the_order_and_every_field_that_all_filled_parts_have(
-    parts: list[Boxes], expected: list[float]
-) -> None:
+def test_concatenate_keeps_order_and_common_fields(parts: list[Boxes], expected: list[float]) -> None:
     joined = Boxes.concatenate(parts)
     assert joined.center[:, 0].tolist() == expected
     assert (joined.label is None) == (not expected), "a part without boxes does not take the labels away"
 
 
-def test_concatenate_drops_a_field_that_one_part_lacks_and_refuses_a_repeated_id() -> None:
+def test_concatenate_drops_partial_fields_refuses_repeated_ids() -> None:
     assert Boxes.concatenate([good()[0], good(score=None)[1]]).score is None
     with pytest.raises(ValueError, match="track_id: rows 0 and 1 have the same id 7"):
         Boxes.concatenate([good()[0], good()[0]])
 
 
-def test_some_are_turned_round_and_the_others_stay_as_they_are() -> None:
+def test_selected_boxes_are_reversed() -> None:
     yaw = [0.1, -3.0, 7.0, math.pi]
     boxes = Boxes(np.zeros((4, 3)), np.ones((4, 3)), yaw, score=[0.1, 0.2, 0.3, 0.4])
     turned = boxes.turned_round([True, True, False, False])
@@ -254,7 +252,7 @@ def test_moving_twice_is_moving_by_the_product(a_SE2_b: SE2, b_SE2_c: SE2) -> No
 
 
 @given(transforms)
-def test_the_corners_of_moved_boxes_are_the_moved_corners(dst_SE2_src: SE2) -> None:
+def test_corners_commute_with_transform(dst_SE2_src: SE2) -> None:
     moved = good().transform(dst_SE2_src)
     np.testing.assert_allclose(moved.bev_corners(), dst_SE2_src.apply(good().bev_corners()), atol=1e-8)
 

@@ -65,7 +65,7 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"cobevglue {cobevglue.__version__}\n"
 
 
-def test_without_a_command_the_help_is_shown_as_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_shows_help_and_exits_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "Usage" in capsys.readouterr().out
 
@@ -105,7 +105,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stderr == "[]\n"
 
 
-def test_an_interruption_is_one_line_and_exit_code_130(
+def test_interruption_exits_130_with_one_line(
     lists: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -138,7 +138,7 @@ def test_align_prints_pose_and_verdict(lists: tuple[Path, Path], capsys: pytest.
     assert all(part in out for part in ("accepted", "20.0", "6.0", "85.9", "7 of 7 and 7"))
 
 
-def test_align_with_json_prints_one_document_and_nothing_else(lists: tuple[Path, Path]) -> None:
+def test_align_json_prints_one_document(lists: tuple[Path, Path]) -> None:
     done = in_subprocess("align", *lists, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
@@ -151,7 +151,7 @@ def test_align_with_json_prints_one_document_and_nothing_else(lists: tuple[Path,
     assert found["evidence"] >= found["margin"] > 0
 
 
-def test_a_refusal_is_exit_code_3_with_a_reason_and_no_pose(tmp_path: Path, lists: tuple[Path, Path]) -> None:
+def test_refusal_exits_3_with_reason_and_no_pose(tmp_path: Path, lists: tuple[Path, Path]) -> None:
     nothing = tmp_path / "nothing.json"
     write_object_list(nothing, Boxes.empty())
     done = in_subprocess("align", lists[0], nothing, "--json")
@@ -202,7 +202,7 @@ BAD_FILES: list[tuple[str, str, str | None, str]] = [
 
 
 @pytest.mark.parametrize(("what", "name", "text", "said"), BAD_FILES, ids=[case[0] for case in BAD_FILES])
-def test_bad_input_is_one_line_that_names_file_and_place(
+def test_bad_input_names_file_and_place(
     what: str,
     name: str,
     text: str | None,
@@ -231,9 +231,7 @@ def test_bad_input_shows_no_traceback(tmp_path: Path) -> None:
     assert done.stderr == f"error: {tmp_path / 'a.json'}: No such file or directory\n"
 
 
-def test_a_picture_of_unknown_format_is_refused_before_anything_is_computed(
-    lists: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_picture_format_is_refused_first(lists: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["align", *map(str, lists), "--picture", "result.doc"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -241,7 +239,7 @@ def test_a_picture_of_unknown_format_is_refused_before_anything_is_computed(
     assert ".png" in err
 
 
-def test_a_picture_that_cannot_be_written_is_one_line(
+def test_unwritable_picture_is_one_error_line(
     lists: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("in the way")
@@ -263,7 +261,7 @@ def write_folders(root: Path, ego_names: list[str], other_names: list[str], with
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
-def test_folders_are_paired_by_name_at_10_hz_and_a_missing_frame_is_a_gap(
+def test_folders_are_paired_by_name_with_gaps(
     with_ids: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folders = write_folders(tmp_path, ["8.json", "9.json", "10.json", "11.json"], ["8.json", "10.json"], with_ids)
@@ -336,12 +334,12 @@ def test_bench_times_every_step(
         assert (timed["8"] is None) == step.startswith("paper"), "what would take too long is left out, and said so"
 
 
-def test_bench_of_weights_that_are_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_with_missing_weights_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--weights", "compcat"]) == 2
     assert "compcat" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_an_object_list_of_the_api_is_an_input(tmp_path: Path) -> None:
+def test_api_object_list_is_valid_input(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(json.dumps(to_dict(EGO)))
     assert main(["align", str(path), str(path), "--json"]) == 0

@@ -71,7 +71,7 @@ def evaluate(*words: str) -> int:
     return main(["evaluate", "--task", "detect", *words])
 
 
-def test_one_document_counts_clouds_and_those_that_are_not_there(
+def test_json_counts_clouds_and_missing_clouds(
     simulated: Path, weights: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluate("--root", str(simulated), "--weights", weights, "--json") == 0
@@ -111,7 +111,7 @@ def test_clouds_without_labels_are_counted(weights: str, tmp_path: Path, capsys:
     assert "none of the 2 clouds has labels: " in capsys.readouterr().err
 
 
-def test_the_table_says_its_range_and_has_both_dialects(
+def test_table_states_range_and_both_ap_dialects(
     simulated: Path, weights: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluate("--root", str(simulated), "--weights", weights, "--range", "60", "40", "--min-points", "2") == 0

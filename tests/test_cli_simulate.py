@@ -82,7 +82,7 @@ def test_labels_have_point_counts_and_speeds(tree: Path) -> None:
     assert label["true_ego_pos"][2] < label["lidar_pose"][2] - 1.5, "the vehicle is below its sensor"
 
 
-def test_it_goes_on_where_it_stopped_with_the_same_bytes(
+def test_resumed_simulation_writes_the_same_bytes(
     tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(layout: OPV2VLayout, task: Task, index: int) -> None:
@@ -114,7 +114,7 @@ def test_workers_write_the_same_bytes(tree: Path, tmp_path: Path) -> None:
     assert contents(tmp_path) == contents(tree)
 
 
-def test_what_goes_wrong_in_a_worker_is_raised_here(tmp_path: Path) -> None:
+def test_worker_error_is_raised_in_parent(tmp_path: Path) -> None:
     settings = ScenarioSettings(frames=2, agents=8, traffic=TrafficSettings(vehicles=1, warm_up=0.0))
     task = Task(0, SimulatedScenario(NETWORK, 1, settings))
     with pytest.raises(ValueError, match="8 agents wanted"):

@@ -56,12 +56,12 @@ def frame(boxes: Boxes, alignments: dict[str, Alignment] | None = None) -> DemoF
     )
 
 
-def test_vehicles_count_where_the_detector_looks_if_anybodys_points_lie_on_them() -> None:
+def test_evaluated_vehicles_have_points_within_range() -> None:
     made = frame(Boxes.empty())
     assert np.flatnonzero(made.counted).tolist() == [SEEN, UNSEEN, PARKED, FAR]
 
 
-def test_hidden_are_those_that_too_few_of_the_egos_points_lie_on() -> None:
+def test_hidden_vehicles_have_few_ego_points() -> None:
     made = frame(Boxes.empty())
     assert np.flatnonzero(made.hidden).tolist() == [UNSEEN, PARKED, FAR]
     assert made.hidden_movers.tolist() == [UNSEEN], "neither the parked one nor the one 63 m away"
@@ -77,7 +77,7 @@ def test_a_verdict_tells_found_vehicles_from_ghosts() -> None:
     assert len(verdict.boxes) == 5, "all that are sure enough and not on a vehicle that does not count"
 
 
-def test_refused_poses_are_not_used_and_others_are_held_against_the_true_ones() -> None:
+def test_refused_poses_are_unused_and_errors_measured() -> None:
     found = {"car2": Alignment(SE2(5.0, 3.0, math.radians(2.0))), "car3": Alignment.refused("no")}
     made = frame(Boxes.empty(), found)
     assert list(made.used_poses(COBEVGLUE)) == ["car2"]
@@ -86,7 +86,7 @@ def test_refused_poses_are_not_used_and_others_are_held_against_the_true_ones() 
     assert math.degrees(radians) == pytest.approx(2.0)
 
 
-def test_the_story_is_the_first_moment_with_most_hidden_movers() -> None:
+def test_story_frame_has_most_hidden_moving_vehicles() -> None:
     calm = frame(Boxes.empty())
     busy = frame(Boxes.empty())
     object.__setattr__(busy, "speed", np.full(6, 10.0))
@@ -113,7 +113,7 @@ def test_the_numbers_are_what_their_names_say(drive: DemoResult) -> None:
     json.dumps(summary, allow_nan=False)
 
 
-def test_all_rows_have_the_same_clouds_and_send_the_same_features(drive: DemoResult) -> None:
+def test_all_rows_share_clouds_and_feature_messages(drive: DemoResult) -> None:
     rows = drive.summary()["rows"]
     assert rows[EGO_ONLY]["bytes_in_all"] is None, "nobody sends anything"
     features = {name: rows[name]["bytes_in_all"] - rows[name]["bytes_for_pose"] for name in ROWS if name != EGO_ONLY}
@@ -122,7 +122,7 @@ def test_all_rows_have_the_same_clouds_and_send_the_same_features(drive: DemoRes
     assert rows[COBEVGLUE]["bytes_for_pose"] == pytest.approx(np.mean(sizes))
 
 
-def test_true_poses_are_exact_attacked_ones_are_the_egos_and_noise_is_as_large_as_it_says(drive: DemoResult) -> None:
+def test_poses_are_exact_attacked_or_noisy_as_set(drive: DemoResult) -> None:
     rows = drive.summary()["rows"]
     assert rows["true_pose"]["median_error_m"] == pytest.approx(0.0, abs=1e-9)
     attacked = [pose for frame in drive.frames for pose in frame.used_poses("attacked_gps").values()]
@@ -130,7 +130,7 @@ def test_true_poses_are_exact_attacked_ones_are_the_egos_and_noise_is_as_large_a
     assert 0.5 < rows["noisy_gps"]["median_error_m"] < 8.0
 
 
-def test_the_egos_own_detections_are_all_that_ego_only_has(drive: DemoResult) -> None:
+def test_ego_only_row_uses_ego_detections_only(drive: DemoResult) -> None:
     for frame in drive.frames:
         assert frame.outputs[EGO_ONLY].alignments == {}
         assert frame.outputs[EGO_ONLY].message_bytes == {}
@@ -202,9 +202,7 @@ def test_the_command_writes_its_files(
     assert "http" not in page.split("<body>")[1].replace("data:image", ""), "nothing is loaded from anywhere"
 
 
-def test_a_folder_that_cannot_be_made_is_one_line_and_said_before_anything_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unwritable_folder_is_one_line_before_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("in the way")
     assert main(["demo", "--out", str(tmp_path / "file" / "out")]) == 2
     out, err = capsys.readouterr()
@@ -221,7 +219,7 @@ def test_a_folder_that_cannot_be_made_is_one_line_and_said_before_anything_else(
         (["torch", "trimesh"], "perception,simulation"),
     ],
 )
-def test_what_is_not_installed_is_named_with_the_extra_that_has_it(
+def test_missing_package_error_names_its_extra(
     missing: list[str], extras: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cobevglue.cli.demo.find_spec", lambda name: None if name in missing else name)

@@ -88,14 +88,14 @@ def test_moving_both_changes_nothing(a: Boxes, b: Boxes, x: float, y: float, yaw
     np.testing.assert_allclose(bev_iou(a.transform(moved), b.transform(moved)), bev_iou(a, b), atol=1e-8)
 
 
-def test_giou_goes_down_with_distance_and_stops_at_the_gate() -> None:
+def test_giou_falls_with_distance_until_the_gate() -> None:
     giou = bev_giou(make([(0, 0, 4, 2, 0)]), make([(x, 0, 4, 2, 0) for x in (0, 3, 6, 12)]), max_distance=10)[0]
     np.testing.assert_allclose(giou, [1.0, 1 / 7, -0.2, -1.0])  # at 6 m the hull is 10 long, 8 of it covered
     with pytest.raises(ValueError, match="max_distance"):
         bev_giou(Boxes.empty(), Boxes.empty(), max_distance=-1)
 
 
-def test_nms_keeps_the_best_of_each_pile_best_first() -> None:
+def test_nms_keeps_best_of_each_cluster() -> None:
     cars = make([(0, 0, 4, 2, 0), (0.5, 0, 4, 2, 0), (20, 0, 4, 2, 90), (20, 0.2, 4, 2, -90), (40, 0, 4, 2, 0)],
                 score=[0.5, 0.9, 0.3, 0.2, 0.6])  # fmt: skip
     assert nms(cars, 0.1).tolist() == [1, 4, 2]

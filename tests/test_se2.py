@@ -42,7 +42,7 @@ def same(a: SE2, b: SE2) -> bool:
         (SE2(10, 0, QUARTER), [1, 0, 7], [10, 1, 7], "z is passed through"),
     ],
 )
-def test_apply_moves_a_point_from_the_source_to_the_destination_frame(
+def test_apply_maps_source_to_destination_point(
     transform: SE2, point: list[float], expected: list[float], why: str
 ) -> None:
     np.testing.assert_allclose(transform.apply(point), expected, atol=1e-12, err_msg=why)
@@ -73,7 +73,7 @@ def test_apply_agrees_with_the_matrix(transform: SE2, p: np.ndarray) -> None:
 
 
 @given(transforms)
-def test_a_transform_and_its_inverse_cancel_on_both_sides(transform: SE2) -> None:
+def test_transform_and_inverse_cancel_on_both_sides(transform: SE2) -> None:
     assert same(transform @ transform.inverse(), SE2())
     assert same(transform.inverse() @ transform, SE2())
     assert same(transform.inverse().inverse(), transform)
@@ -127,7 +127,7 @@ def test_what_is_no_planar_rigid_transform_is_refused(matrix: Any, expected: str
 
 @pytest.mark.parametrize("field", ["x", "y", "yaw"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, "far", None, [1.0, 2.0]])
-def test_a_component_that_is_no_finite_number_is_refused_by_name(field: str, value: Any) -> None:
+def test_non_finite_component_is_refused_by_name(field: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"SE2\.{field} must be"):
         SE2(**{field: value})
 
@@ -150,13 +150,13 @@ def test_points_of_another_dimension_are_refused(shape: tuple[int, ...]) -> None
         (7 * math.pi, -math.pi),
     ],
 )
-def test_wrap_angle_is_the_same_direction_in_minus_pi_to_pi(angle: float, expected: float) -> None:
+def test_wrap_angle_keeps_the_direction(angle: float, expected: float) -> None:
     assert wrap_angle(angle) == pytest.approx(expected, abs=1e-12)
 
 
 @given(st.floats(-1e6, 1e6))
 @example(float(np.nextafter(-math.pi, -4)))  # its remainder rounds to 2 pi
-def test_a_wrapped_angle_is_in_the_interval_and_the_same_direction(angle: float) -> None:
+def test_wrapped_angle_is_in_interval_with_same_direction(angle: float) -> None:
     for wrapped in (float(wrap_angle(angle)), (SE2(yaw=angle) @ SE2()).yaw):
         assert -math.pi <= wrapped < math.pi
         assert math.cos(wrapped - angle) == pytest.approx(1.0)
@@ -183,7 +183,7 @@ def test_the_error_is_distance_and_the_shorter_turn(a: SE2, b: SE2, distance: fl
     assert b.error_to(a) == pytest.approx((distance, turn), abs=1e-12)
 
 
-def test_it_is_immutable_hashable_and_can_be_sent_to_another_process() -> None:
+def test_se2_is_immutable_hashable_and_picklable() -> None:
     transform = SE2(1, 2, 3)
     with pytest.raises(FrozenInstanceError):
         transform.x = 4.0  # type: ignore[misc]

@@ -91,9 +91,7 @@ def compact() -> PointPillars:
     return PointPillars.pretrained("compact")
 
 
-def test_a_self_localised_system_gives_the_same_bytes_whatever_poses_are_claimed(
-    frames: RealFrames, compact: PointPillars
-) -> None:
+def test_self_localised_output_ignores_claimed_poses(frames: RealFrames, compact: PointPillars) -> None:
     absurd = {"car1": pose(1e6, -4e5, 2.0), "car2": np.full((4, 4), np.nan)}
     outputs: list[list[tuple[bytes, SE2 | None]]] = []
     for claims in ("none", "true", "absurd"):
@@ -108,9 +106,7 @@ def test_a_self_localised_system_gives_the_same_bytes_whatever_poses_are_claimed
     assert outputs[0][-1][1] is not None
 
 
-def test_bevglue_finds_the_real_pose_and_others_see_what_the_ego_does_not(
-    frames: RealFrames, compact: PointPillars
-) -> None:
+def test_bevglue_pose_is_right_and_reveals_hidden(frames: RealFrames, compact: PointPillars) -> None:
     system = CoBEVGlue(compact, method("late", compact), group_aligner("bevglue"))
     for clouds, poses, time in frames:
         out = system.step(clouds, "car1", time)
@@ -124,7 +120,7 @@ def test_bevglue_finds_the_real_pose_and_others_see_what_the_ego_does_not(
         assert sent["boxes"] > out.alignment_bytes["car2"] > 0
 
 
-def test_what_comes_out_faces_as_the_ego_told_others_it_does(frames: RealFrames, compact: PointPillars) -> None:
+def test_output_headings_follow_transmitted_headings(frames: RealFrames, compact: PointPillars) -> None:
     """The fused head is made to mix up front and back; the boxes that the ego tracks know better."""
     confused = method("cobevglue", compact)
     assert isinstance(confused, IntermediateFusion)
@@ -141,7 +137,7 @@ def test_what_comes_out_faces_as_the_ego_told_others_it_does(frames: RealFrames,
     assert (np.cos(boxes.yaw[rows] - own.yaw[iou[rows].argmax(axis=1)]) > 0).all()
 
 
-def test_the_bytes_of_the_feature_message_are_its_three_maps_in_float16() -> None:
+def test_feature_message_is_three_float16_maps() -> None:
     detector = small_detector()
     system = CoBEVGlue(detector, method("cobevglue", detector), Fixed({"b": SE2()}))
     out = system.step({"a": cloud(1), "b": cloud(2)}, "a")
@@ -164,7 +160,7 @@ def test_whoever_is_refused_takes_no_part(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUSION_METHODS)
-def test_every_method_takes_any_number_of_agents_and_empty_clouds(name: str) -> None:
+def test_methods_take_any_agents_and_empty_clouds(name: str) -> None:
     detector = small_detector()
     poses = {"b": SE2(3.0, 1.0, 0.2), "c": SE2(-4.0, 0.0, 3.0), "d": SE2(0.0, 2.0, -1.0)}
     system = CoBEVGlue(detector, method(name, detector), Fixed(poses))
@@ -189,7 +185,7 @@ def test_the_ego_is_not_among_its_boxes() -> None:
     assert len(out.boxes) == len(found) - int(covers_origin(found).sum())
 
 
-def test_an_aligner_is_given_what_it_needs_and_nothing_else() -> None:
+def test_aligner_receives_only_what_it_needs() -> None:
     detector = small_detector()
     aligner = Fixed({})
     system = CoBEVGlue(detector, method("none", detector), aligner)
@@ -199,7 +195,7 @@ def test_an_aligner_is_given_what_it_needs_and_nothing_else() -> None:
         assert (seen.pose, seen.points, seen.features, seen.variance) == (None, None, None, None)
 
 
-def test_given_localisation_is_the_relative_pose_of_the_claims() -> None:
+def test_given_localisation_is_relative_claimed_pose() -> None:
     detector = small_detector()
     system = CoBEVGlue(detector, method("late", detector), group_aligner("given"))
     claims = {"a": pose(100.0, 50.0, 1.0), "b": pose(110.0, 50.0, 1.5)}
@@ -224,7 +220,7 @@ def test_nothing_fused_needs_no_poses() -> None:
     np.testing.assert_array_equal(out.boxes.bev, told.boxes.bev)
 
 
-def test_agents_come_and_go_and_another_ego_starts_afresh() -> None:
+def test_agents_come_and_go_and_new_ego_resets() -> None:
     detector = small_detector()
     system = CoBEVGlue(detector, method("cobevglue", detector), group_aligner("bevglue"))
     for number, (names, ego) in enumerate([("ab", "a"), ("a", "a"), ("abc", "a"), ("bc", "b")]):
@@ -245,7 +241,7 @@ def test_agents_come_and_go_and_another_ego_starts_afresh() -> None:
         ({"car1": cloud(1)}, "car1", {"car1": np.full((4, 4), np.nan)}, "poses: car1: must be finite"),
     ],
 )
-def test_bad_input_is_one_line_that_names_the_agent(
+def test_bad_input_names_the_agent(
     clouds: dict[str, np.ndarray], ego: str, poses: dict[str, np.ndarray] | None, problem: str
 ) -> None:
     detector = small_detector()

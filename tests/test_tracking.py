@@ -116,7 +116,7 @@ def test_everything_stands_still_and_the_agent_drives(
     assert ids_of(frames, Sort(config)) == [list(range(len(scene)))] * len(frames)
 
 
-def test_cars_that_come_into_view_are_predicted_by_the_motion_of_the_frame() -> None:
+def test_new_tracks_are_predicted_by_frame_motion() -> None:
     """At 30 m/s each slides back by 3 m a frame: in a dense row its neighbour would be as near as itself."""
     gaps = np.random.default_rng(0).uniform(5.0, 8.0, 80)
     gaps[10:] *= 0.75  # dense once the motion is known
@@ -151,7 +151,7 @@ def test_a_frame_that_is_known_to_stand_still() -> None:
 
 
 @pytest.mark.parametrize("flipped", [{3}, {3, 6}, {4, 5}, set(range(1, 12, 3))])
-def test_a_flipped_heading_neither_breaks_the_track_nor_turns_it(flipped: set[int]) -> None:
+def test_flipped_heading_does_not_break_track(flipped: set[int]) -> None:
     tracker = Sort()
     for k in range(12):
         boxes = cars([(k, 0), (20, 5)], [30 + 180 * (k in flipped), 0])
@@ -191,7 +191,7 @@ def test_boxes_face_as_most_of_their_track_did(seen: str, told: str) -> None:
         np.testing.assert_array_equal(faced.center, boxes.center)
 
 
-def test_one_that_is_sure_outvotes_two_that_are_not() -> None:
+def test_confident_heading_outvotes_two_unconfident() -> None:
     tracker = Sort()
     told = []
     for flipped, sure in ((False, 0.9), (True, 0.2), (True, 0.2), (False, 0.9), (True, 1.0), (True, 1.0)):
@@ -209,7 +209,7 @@ def test_bad_votes_are_refused_and_change_nothing(sure: object) -> None:
     tracker.update(cars([(0, 0), (0, 15)]), 1.0)  # time did not go on
 
 
-def test_only_boxes_of_the_last_update_can_be_faced() -> None:
+def test_heading_votes_need_boxes_of_last_update() -> None:
     tracker = Sort()
     boxes = tracker.update(cars([(0, 0), (0, 15)]))
     assert tracker.vote_headings(boxes[[1]]).track_id is not None
@@ -241,7 +241,7 @@ def test_boxes_come_back_unchanged() -> None:
     assert tracked.track_id.tolist() == [0, 1]
 
 
-def test_tracks_include_what_is_out_of_sight_just_now() -> None:
+def test_tracks_include_temporarily_missed_objects() -> None:
     tracker = Sort()
     for k in range(10):
         tracker.update(cars([(k, 0), (40, 3), (40, 9), (40, -9)]), time=5.0 + 0.1 * k)
@@ -271,7 +271,7 @@ def test_bad_time_is_refused_and_changes_nothing(time: float) -> None:
     assert ids_of([cars([(1.0, 0)])], tracker) == [[0]]
 
 
-def test_reset_forgets_tracks_and_time_but_uses_no_id_again() -> None:
+def test_reset_clears_tracks_and_never_reuses_ids() -> None:
     tracker, boxes = Sort(), cars([(0, 0), (10, 0)])
     tracker.update(boxes, time=100.0)
     tracker.reset()
@@ -302,7 +302,7 @@ scene = st.lists(st.lists(st.tuples(coordinate, coordinate), max_size=6).map(car
 
 @given(scene)
 @settings(deadline=None)
-def test_ids_are_unique_in_a_frame_and_the_same_for_the_same_input(frames: list[Boxes]) -> None:
+def test_ids_are_unique_and_deterministic(frames: list[Boxes]) -> None:
     ids = ids_of(frames)
     assert [len(frame) for frame in ids] == [len(boxes) for boxes in frames]
     assert ids == ids_of(frames)

@@ -20,7 +20,7 @@ def test_an_alignment_with_a_pose_is_accepted() -> None:
     assert alignment.reason == ""
 
 
-def test_a_refusal_has_no_pose_no_matches_no_certainty_and_a_reason() -> None:
+def test_refusal_has_reason_and_no_pose() -> None:
     alignment = Alignment.refused("too dark", evidence=3.0, margin=1.0)
     assert not alignment.accepted
     assert alignment.ego_SE2_other is None
@@ -31,7 +31,7 @@ def test_a_refusal_has_no_pose_no_matches_no_certainty_and_a_reason() -> None:
     assert (alignment.evidence, alignment.margin) == (3.0, 1.0)
 
 
-def test_an_aligner_that_measures_no_evidence_leaves_it_unknown() -> None:
+def test_unmeasured_evidence_is_unknown() -> None:
     refused = Alignment.refused("no reason")
     assert math.isnan(refused.evidence)
     assert math.isnan(refused.margin)
@@ -50,7 +50,7 @@ def test_an_alignment_cannot_be_changed() -> None:
 
 @pytest.mark.usefixtures("warm_kernels")
 @pytest.mark.parametrize("name", sorted(name for name, made in ALIGNERS.items() if not issubclass(made, GroupAligner)))
-def test_every_registered_aligner_starts_without_arguments_and_finds_an_easy_pose(name: str) -> None:
+def test_registered_aligners_solve_an_easy_scene(name: str) -> None:
     scene = pair_of_views(common=10, seed=4)
     made = ALIGNERS[name]
     assert not issubclass(made, GroupAligner)
@@ -64,7 +64,7 @@ def test_every_registered_aligner_starts_without_arguments_and_finds_an_easy_pos
 @pytest.mark.usefixtures("warm_kernels")
 @pytest.mark.parametrize("config", [BEVGlueConfig(), BEVGlueConfig.paper()], ids=["robust", "paper"])
 @pytest.mark.parametrize("common", range(6))
-def test_a_reason_stands_exactly_where_there_is_no_pose(config: BEVGlueConfig, common: int) -> None:
+def test_reason_is_set_exactly_without_pose(config: BEVGlueConfig, common: int) -> None:
     scene = pair_of_views(common, seed=7, only_ego=2, only_other=3)
     alignment = BEVGlue(config).align(scene.ego, scene.other)
     assert alignment.accepted == (alignment.reason == "")

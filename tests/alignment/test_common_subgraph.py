@@ -72,7 +72,7 @@ def test_edge_affinities_by_hand(ego: Sequence[float], other: Sequence[float], a
 L_SHAPE = [(0, 0, 0), (20, 0, 0), (20, 15, 90)]
 
 
-def test_expansion_takes_all_that_agree_with_the_seed_and_nothing_else() -> None:
+def test_expansion_takes_exactly_the_consistent_pairs() -> None:
     ego = cars([*L_SHAPE, (-30, 10, 45)])
     other = cars([*L_SHAPE, (-30, -10, 45)]).transform(SE2(7.0, 100.0, 2.0))
     pairs, confidence = subgraph(ego, other)
@@ -94,7 +94,7 @@ def test_more_nodes_win_against_a_higher_confidence() -> None:
     assert subgraph(ego, Boxes.concatenate([vague, exact]))[0] == {(0, 0), (1, 1), (2, 2)}
 
 
-def test_the_boxes_of_the_seed_belong_to_each_other_only() -> None:
+def test_seed_boxes_match_each_other_only() -> None:
     """A second detection of the seed's car, half a metre beside it, in either list."""
     twice = cars([*L_SHAPE, (0.5, 0, 0)])
     assert subgraph(cars(L_SHAPE), twice, np.array([[0, 0]]))[0] == {(0, 0), (1, 1), (2, 2)}
@@ -140,7 +140,7 @@ def test_a_threshold_is_exceeded_not_reached() -> None:
 
 
 @pytest.mark.parametrize(("n_ego", "n_other"), [(0, 0), (0, 3), (3, 0), (1, 1), (1, 3)])
-def test_few_boxes_have_a_subgraph_of_at_most_that_many(n_ego: int, n_other: int) -> None:
+def test_subgraph_size_is_bounded_by_box_count(n_ego: int, n_other: int) -> None:
     pairs, _ = subgraph(cars(L_SHAPE[:n_ego]), cars(L_SHAPE[:n_other]))
     assert len(pairs) == min(n_ego, n_other)
 
@@ -185,7 +185,7 @@ THREE, NEW_FOUR = {(0, 0), (1, 1), (2, 2)}, {(3, 3), (4, 4), (5, 5), (6, 6)}
         pytest.param([10, 91, 92], [93, 51, 52], NEW_FOUR, id="ids survived, but no pair of them"),
     ],
 )
-def test_later_frames_are_seeded_by_the_tracks_of_the_last_subgraph(
+def test_later_frames_are_seeded_by_carried_tracks(
     ego_ids: Sequence[int], other_ids: Sequence[int], expected: Pairs
 ) -> None:
     glue = BEVGlue(BEVGlueConfig.paper())
@@ -212,14 +212,14 @@ def test_the_paper_starts_anew(forget: str) -> None:
     assert pairs_of(glue.align(ego, other, time=100.0 if forget == "gap" else 1.1)) == NEW_FOUR
 
 
-def test_an_empty_frame_in_between_loses_the_pairs_and_nothing_breaks() -> None:
+def test_empty_frame_drops_carried_pairs() -> None:
     glue = BEVGlue(BEVGlueConfig.paper())
     glue.align(*FIRST)
     assert not glue.align(FIRST[0][[]], FIRST[1]).accepted
     assert pairs_of(glue.align(*both([10, 11, 12], [50, 51, 52]))) == NEW_FOUR
 
 
-def test_surviving_pairs_are_looked_up_by_id_on_both_sides() -> None:
+def test_surviving_pairs_are_matched_by_track_id() -> None:
     ego = ObjectGraph.of(cars(L_SHAPE).replace(track_id=[4, 2**62, -6]))
     other = ObjectGraph.of(cars(L_SHAPE[:2]).replace(track_id=[8, 9]))
     tracks = np.array([[2**62, 9], [4, 7], [5, 8], [-6, 8]])
@@ -298,7 +298,7 @@ def test_the_subgraph_is_the_best_of_all_stars(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_on_consistent_scenes_the_star_is_the_maximum_clique(seed: int) -> None:
+def test_star_equals_maximum_clique_on_consistent_scenes(seed: int) -> None:
     """Both see the same objects without errors: the seed's edges alone already say what all edges say."""
     scene = pair_of_views(3 + seed % 5, seed, noise=(0.0, 0.0, 0.0, 0.0))
     pairs, _ = subgraph(scene.ego, scene.other, config=AffinityConfig())
@@ -306,7 +306,7 @@ def test_on_consistent_scenes_the_star_is_the_maximum_clique(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_star_is_never_smaller_than_the_maximum_clique(seed: int) -> None:
+def test_star_is_at_least_the_maximum_clique(seed: int) -> None:
     """With clutter and errors a star may hold more than a clique, as its members are checked against the seed only."""
     scene = pair_of_views(3, seed, only_ego=3, only_other=3, reach=15.0)
     pairs, _ = subgraph(scene.ego, scene.other, config=AffinityConfig())
@@ -322,7 +322,7 @@ def align_once(ego: Boxes, other: Boxes) -> Alignment:
 
 @given(seed=st.integers(0, 10**6), n=st.integers(3, 8))
 @settings(max_examples=40, deadline=None)
-def test_without_noise_the_pose_is_exact_in_whatever_order_the_rows_come(seed: int, n: int) -> None:
+def test_noiseless_pose_is_exact_for_any_row_order(seed: int, n: int) -> None:
     rng = np.random.default_rng([seed, 0, 0])
     world = random_boxes(n, rng)
     ego_SE2_world, other_SE2_world = random_pose(rng), random_pose(rng)

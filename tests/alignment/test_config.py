@@ -12,7 +12,7 @@ from cobevglue.alignment import AffinityConfig
 
 
 @pytest.mark.parametrize("config", [BEVGlueConfig, AffinityConfig])
-def test_an_unknown_field_is_an_error_that_names_it(config: type[BEVGlueConfig] | type[AffinityConfig]) -> None:
+def test_unknown_field_is_named(config: type[BEVGlueConfig] | type[AffinityConfig]) -> None:
     with pytest.raises(ValidationError, match="one_to_won"):
         config.model_validate({"one_to_won": True})
 
@@ -41,7 +41,7 @@ def test_an_unknown_field_is_an_error_that_names_it(config: type[BEVGlueConfig] 
         ("affinity", {"node_threshold": 1.5}),
     ],
 )
-def test_a_value_out_of_its_range_is_an_error_that_names_the_field(field: str, value: object) -> None:
+def test_out_of_range_value_is_named(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
         BEVGlueConfig.model_validate({field: value})
 
@@ -59,7 +59,7 @@ def test_settings_survive_a_file_and_cannot_be_changed(config: BEVGlueConfig) ->
         config.verdict = False
 
 
-def test_the_paper_is_the_affinity_method_without_a_verdict() -> None:
+def test_paper_preset_uses_affinity_without_verdict() -> None:
     paper = BEVGlueConfig.paper()
     assert paper.method == "affinity"
     assert not paper.verdict

@@ -34,7 +34,7 @@ def footprints(*length_and_width: tuple[float, float]) -> FloatArray:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.0, math.pi, -math.pi, 3.2, -7.0, 100.0])
-def test_angles_wrap_to_a_turn_and_to_half_a_turn(angle: float) -> None:
+def test_angle_differences_wrap_at_full_and_half_turn(angle: float) -> None:
     assert wrap(angle) == pytest.approx(float(wrap_angle(angle)))
     half = wrap_half_turn(angle)
     assert -math.pi / 2 <= half < math.pi / 2
@@ -42,7 +42,7 @@ def test_angles_wrap_to_a_turn_and_to_half_a_turn(angle: float) -> None:
     assert math.cos(2.0 * (half - angle)) == pytest.approx(1.0), "the same axis"
 
 
-def test_equal_sizes_speak_for_one_object_and_the_more_they_differ_the_less() -> None:
+def test_size_evidence_falls_with_size_difference() -> None:
     table = size_evidence(footprints((4.5, 1.9)), footprints((4.5, 1.9), (5.0, 1.9), (7.0, 1.9), (7.0, 2.5)), NOISE)[0]
     assert table[0] == pytest.approx(NOISE.size_gain)
     assert list(table) == sorted(table, reverse=True)
@@ -62,7 +62,7 @@ def test_sizes_can_be_left_out() -> None:
 
 @pytest.mark.parametrize("gap", [0.0, 0.4, 1.5, 4.0])
 @pytest.mark.parametrize("variance", [0.25, 1.0])
-def test_position_evidence_is_a_gaussian_against_a_uniform_density(gap: float, variance: float) -> None:
+def test_position_evidence_is_gaussian_over_uniform_density(gap: float, variance: float) -> None:
     """What a distance adds, as scipy has it: log N(gap) - log density; the heading's share is the same for all."""
     density = multivariate_normal([0.0, 0.0], variance * np.eye(2)).logpdf([gap, 0.0]) - math.log(NOISE.density)
     nearest = multivariate_normal([0.0, 0.0], np.eye(2)).logpdf([0.0, 0.0]) - math.log(NOISE.density)
@@ -70,7 +70,7 @@ def test_position_evidence_is_a_gaussian_against_a_uniform_density(gap: float, v
     assert found == pytest.approx(density - nearest)
 
 
-def test_the_evidence_of_headings_falls_with_their_difference_up_to_a_right_angle() -> None:
+def test_heading_evidence_falls_to_a_right_angle() -> None:
     evidence = [pair_evidence(0.0, math.radians(h), 0.25, NOISE) for h in (0, 2, 5, 10, 20)]
     assert evidence == sorted(evidence, reverse=True)
     assert len(set(evidence)) == 5
@@ -84,13 +84,13 @@ def test_a_turned_heading_costs_its_log_odds(heading: float) -> None:
     assert straight - turned == pytest.approx(math.log(0.9 / 0.1))
 
 
-def test_without_flips_a_turned_heading_rules_a_pair_out() -> None:
+def test_without_flips_reversed_heading_rules_pair_out() -> None:
     plain = NOISE._replace(use_flips=False)
     assert pair_evidence(0.0, math.pi, 0.25, plain) < -10.0
     assert pair_evidence(0.0, 0.0, 0.25, plain) > pair_evidence(0.0, 0.0, 0.25, NOISE)
 
 
-def test_the_less_likely_chance_is_the_more_a_pair_counts() -> None:
+def test_lower_density_gives_pairs_more_evidence() -> None:
     """Where boxes are twice as dense, a pair that lies together counts log 2 less."""
     dense = NOISE._replace(density=2.0 * NOISE.density)
     assert pair_evidence(0.2, 0.1, 0.3, NOISE) - pair_evidence(0.2, 0.1, 0.3, dense) == pytest.approx(math.log(2.0))

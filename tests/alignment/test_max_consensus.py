@@ -117,7 +117,7 @@ def test_the_search_finds_the_largest_consensus(seed: int) -> None:
     assert count == best_by_brute_force(ego, other, claimed)
 
 
-def test_of_equally_many_the_nearer_ones_win_then_the_smaller_shift() -> None:
+def test_ties_prefer_nearer_pairs_then_smaller_shift() -> None:
     search = MaximumConsensus(shift=2.0, turn=0.0)
     at = np.array([[0.0, 0.0], [10.0, 0.0]])
     assert search._most_agreed(at, at + (1.0, 0.5), SE2()) == SE2(-1.0, -0.5)

@@ -33,7 +33,7 @@ def test_edges_of_three_boxes_by_hand() -> None:
     np.testing.assert_allclose(edge[2, 1], [math.sqrt(125.0), math.pi - math.atan2(5.0, 10.0), -right], atol=1e-12)
 
 
-def test_an_edge_leads_from_one_box_to_the_other() -> None:
+def test_edge_points_from_first_to_second_box() -> None:
     """Walking rho along theta, in the heading frame of the first box, ends at the second box with heading psi."""
     boxes = random_boxes(8, np.random.default_rng([1, 0, 0]))
     edge = ObjectGraph.of(boxes).edge
@@ -68,7 +68,7 @@ def test_edges_do_not_depend_on_the_frame(seed: int, n: int, x: float, y: float,
     np.testing.assert_array_equal(there.node, here.node)
 
 
-def test_nodes_are_length_and_width_and_keep_the_track_ids() -> None:
+def test_nodes_keep_size_and_track_ids() -> None:
     boxes = Boxes([[1, 2, 3], [4, 5, 6]], [[4.0, 2.0, 1.5], [9.0, 2.5, 3.0]], [0.1, 0.2], track_id=[7, 3])
     graph = ObjectGraph.of(boxes)
     assert graph.node.tolist() == [[4.0, 2.0], [9.0, 2.5]]
@@ -87,7 +87,7 @@ def test_no_box_and_one_box_are_graphs_too() -> None:
     assert single.edge.tolist() == [[[0.0, 0.0, 0.0]]]
 
 
-def test_boxes_in_one_place_have_edges_of_length_zero() -> None:
+def test_coincident_boxes_have_zero_length_edges() -> None:
     edge = ObjectGraph.of(cars([(5, 5, 0), (5, 5, 30)])).edge
     assert np.isfinite(edge).all()
     assert edge[0, 1, 0] == 0.0

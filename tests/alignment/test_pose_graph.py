@@ -90,7 +90,7 @@ def test_agents_are_solved_for_jointly() -> None:
     assert found["car3"].matches.shape == (0, 2)
 
 
-def test_the_rear_taken_for_the_front_does_not_matter() -> None:
+def test_reversed_headings_do_not_matter() -> None:
     turned = seen_from(CAR2)
     turned = turned.replace(yaw=turned.yaw + np.array([math.pi, 0.0, -math.pi, 0.0]))
     found = align(CoAlign(), {"car1": boxes_at(seen_from(CAR1), CAR1), "car2": boxes_at(turned, CAR2 @ OFF)})["car2"]
@@ -166,7 +166,7 @@ def test_the_covariance_is_honest() -> None:
         (0, 0.01, "car2 sees nothing"),
     ],
 )
-def test_claims_stay_where_there_is_too_little_to_go_by(common: int, variance: float | FloatArray, reason: str) -> None:
+def test_claims_are_kept_without_enough_landmarks(common: int, variance: float | FloatArray, reason: str) -> None:
     found = align(
         CoAlign(),
         {
@@ -189,7 +189,7 @@ def test_landmarks_whose_headings_disagree_are_not_used() -> None:
     assert pairs_of(found) == {(i, i) for i in range(4)}
 
 
-def test_an_agent_that_nothing_ties_to_the_ego_stays_where_it_claims() -> None:
+def test_disconnected_agent_keeps_its_claimed_pose() -> None:
     """car3 and car4 share four cars with each other, but none with the ego and car2."""
     far = SE2(200.0, 0.0, 0.0)
     observations = {
@@ -241,7 +241,7 @@ def test_boxes_of_one_agent_are_never_joined() -> None:
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 30), agents=st.integers(1, 5))
 @settings(max_examples=60, deadline=None)
-def test_a_landmark_never_holds_two_boxes_of_one_agent(seed: int, n: int, agents: int) -> None:
+def test_landmark_has_one_box_per_agent(seed: int, n: int, agents: int) -> None:
     rng = np.random.default_rng([seed, 4, 0])
     xy, agent = rng.uniform(0.0, 6.0, (n, 2)), rng.integers(agents, size=n)
     groups = landmarks(xy, agent)

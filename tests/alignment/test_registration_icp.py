@@ -128,7 +128,7 @@ def test_exact_points_give_the_exact_motion() -> None:
 
 
 @BOTH
-def test_pairs_may_be_as_far_apart_as_the_gates_say(name: str) -> None:
+def test_pairs_up_to_the_gate_distance_are_used(name: str) -> None:
     """From 3 m off, one narrow gate sees little of what belongs together; a wide one first does."""
     off = SE2(2.5, 1.6, 0.0)
     narrow, wide = (align(group_aligner(name, gates=gates), pair(off))["other"] for gates in ((0.5,), (5.0, 0.5)))

@@ -66,7 +66,7 @@ def test_out_of_steps_it_is_still_a_clique() -> None:
     assert 5 < len(hasty) <= len(thorough)
 
 
-def test_the_same_graph_has_the_same_answer_and_stays_as_it_is() -> None:
+def test_clique_is_deterministic_and_leaves_graph_unchanged() -> None:
     adjacent = graph(80, 0.4, 5)
     np.fill_diagonal(adjacent, True)
     before = adjacent.copy()

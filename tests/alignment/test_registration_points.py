@@ -43,7 +43,7 @@ def sent(name: str, budget: int | None, observation: Observation, frame: int = 0
 
 @given(name=st.sampled_from(NAMES), budget=st.integers(256, 60_000))
 @settings(max_examples=40, deadline=None)
-def test_all_messages_together_fit_the_budget_and_use_it(name: str, budget: int) -> None:
+def test_messages_fill_but_never_exceed_the_budget(name: str, budget: int) -> None:
     observation = seen_by(name)
     parts = sent(name, budget, observation)
     size = sum(len(part) for part in parts.values())
@@ -94,7 +94,7 @@ def test_what_arrived_is_looked_at_as_it_is(name: str) -> None:
     np.testing.assert_allclose(arrived.points, mine.points, atol=0.00501)
 
 
-def test_the_same_frame_is_the_same_bytes_and_another_frame_another_sample() -> None:
+def test_sampling_is_deterministic_per_frame() -> None:
     observation = seen_by("icp-3d")
     first, again, next_one = (sent("icp-3d", 3000, observation, frame) for frame in (4, 4, 5))
     assert first == again

@@ -68,13 +68,13 @@ def test_a_pair_that_overlaps_more_counts_more() -> None:
     assert 10.0 < consistent_poses(pairs)[1].x < 10.1
 
 
-def test_the_mean_ignores_what_is_far_from_the_rest() -> None:
+def test_robust_mean_ignores_outliers() -> None:
     near = [SE2(1.0 + 0.1 * i, 2.0, 0.5) for i in range(-2, 3)]
     mean = robust_mean([*near, SE2(30.0, -4.0, 2.0), SE2(31.0, -4.0, 2.0)], np.ones(7))
     assert mean.error_to(SE2(1.0, 2.0, 0.5)) == pytest.approx((0.0, 0.0), abs=0.05)
 
 
-def test_headings_on_both_sides_of_the_cut_have_their_mean_there() -> None:
+def test_mean_heading_is_right_across_the_cut() -> None:
     mean = robust_mean([SE2(0.0, 0.0, 3.1), SE2(0.0, 0.0, -3.1)], np.ones(2))
     assert abs(mean.yaw) == pytest.approx(np.pi, abs=1e-6)
 
@@ -90,7 +90,7 @@ _SMALL = st.floats(-0.3, 0.3)
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(_SMALL, _SMALL, st.floats(-0.02, 0.02)), min_size=12, max_size=12))
-def test_answers_are_at_most_as_far_off_as_what_they_are_made_of(errors: list[tuple[float, float, float]]) -> None:
+def test_error_of_mean_is_bounded_by_inputs(errors: list[tuple[float, float, float]]) -> None:
     pairs = {
         pair: (pose @ SE2(*error), weight)
         for (pair, (pose, weight)), error in zip(true_pairs().items(), errors, strict=True)

@@ -152,14 +152,14 @@ def check_boxes(found: Boxes, expected: Boxes, atol: float = 1e-6) -> None:
 
 
 @pytest.mark.parametrize("agent", ["vehicle", "infrastructure"])
-def test_poses_chain_the_calibrations_and_add_the_offset_of_the_pair(root: Path, agent: str) -> None:
+def test_poses_chain_calibrations_and_pair_offset(root: Path, agent: str) -> None:
     frame = DAIRV2X(root, "val")["34"][0]
     np.testing.assert_allclose(frame.agents[agent].world_SE3_lidar, world_SE3(agent), atol=1e-9)
     assert frame.agents[agent].is_infrastructure == (agent == "infrastructure")
 
 
 @pytest.mark.parametrize("agent", ["vehicle", "infrastructure"])
-def test_own_labels_are_in_the_agents_frame_and_only_vehicles_with_a_box(root: Path, agent: str) -> None:
+def test_own_labels_are_vehicles_in_agent_frame(root: Path, agent: str) -> None:
     objects = DAIRV2X(root, "val")["34"][0].agents[agent].objects
     check_boxes(objects, transform_boxes(TRUTH, inverse_SE3(world_SE3(agent))))
     assert objects.track_id is None  # the data set has no ids
@@ -184,7 +184,7 @@ def test_both_sets_of_labels_can_be_had(root: Path) -> None:
     assert len(original.agents["infrastructure"].objects) == 2  # there is one set of these
 
 
-def test_a_release_without_complemented_labels_is_not_taken_for_one(root: Path) -> None:
+def test_missing_complemented_labels_raise(root: Path) -> None:
     shutil.rmtree(root / "vehicle-side/label/lidar_backup")
     with pytest.raises(FileNotFoundError, match=r"label_world_backup is there but .*lidar_backup is not"):
         DAIRV2X(root, "val")
@@ -197,7 +197,7 @@ def test_a_release_without_complemented_labels_is_not_taken_for_one(root: Path) 
         DAIRV2X(root, "val", labels="new")  # type: ignore[arg-type]
 
 
-def test_frames_are_in_the_order_of_time_and_a_missing_one_is_a_gap(root: Path) -> None:
+def test_frames_are_in_time_order_with_gaps(root: Path) -> None:
     frames = DAIRV2X(root, "val")["34"]
     assert [frame.timestamp for frame in frames] == list(CAR_FRAMES)
     assert [frame.time for frame in frames] == pytest.approx([0.0, 0.1, 0.3])
@@ -227,12 +227,12 @@ def test_the_official_split_file_is_understood(root: Path, tmp_path: Path) -> No
     assert [f.timestamp for f in DAIRV2X(root, "mine", split_file=tmp_path / "mine.json")["34"]] == ["015441"]
 
 
-def test_no_split_file_says_where_it_was_looked_for(root: Path) -> None:
+def test_missing_split_file_error_lists_places(root: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"looked for .*train\.json, .*cooperative-split-data\.json"):
         DAIRV2X(root, "train")
 
 
-def test_a_root_that_is_something_else_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_wrong_root_error_says_what_was_expected(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"looked for .*cooperative/data_info\.json"):
         DAIRV2X(tmp_path, "val")
 
@@ -243,7 +243,7 @@ def test_an_unknown_batch_names_the_nearest(root: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", [Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED])
-def test_clouds_are_right_handed_with_an_intensity_of_8_bits_and_may_be_missing(root: Path, encoding: Encoding) -> None:
+def test_clouds_are_right_handed_and_may_be_missing(root: Path, encoding: Encoding) -> None:
     points = np.array([[1, 2, 3, 51], [np.nan, 0, 0, 0], [4, -5, 6, 255]], dtype=np.float32)
     (root / "vehicle-side/velodyne").mkdir()
     PointCloud.from_xyzi_points(points).save(root / "vehicle-side/velodyne/015438.pcd", encoding=encoding)
@@ -273,7 +273,7 @@ def test_other_classes_can_be_asked_for(root: Path, kind: str) -> None:
     np.testing.assert_array_equal(objects.label, ["pedestrian"])
 
 
-def test_a_frame_without_labels_of_its_side_has_no_objects(root: Path) -> None:
+def test_frame_without_side_labels_has_no_objects(root: Path) -> None:
     dump(root / "vehicle-side/label/lidar/015438.json", [])
     dump(root / "cooperative/label_world/015438.json", [])
     frame = DAIRV2X(root, "val")["34"][0]
@@ -347,7 +347,7 @@ def test_a_broken_index_is_noticed_at_once(root: Path, file: str, change: Any, m
         DAIRV2X(root, "val")
 
 
-def test_broken_corners_and_missing_or_garbled_files_are_named(root: Path) -> None:
+def test_broken_or_missing_files_are_named(root: Path) -> None:
     path = root / "cooperative/label_world/015438.json"
     frame = DAIRV2X(root, "val")["34"][0]
     edit(path, lambda rows: rows[1]["world_8_points"].pop())

@@ -80,7 +80,7 @@ def test_what_is_written_is_read_back(labels: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(scenario[1].ground_truth("vehicle").label, ["car", "bus"])
 
 
-def test_two_wheelers_are_there_for_who_asks_for_them(tmp_path: Path) -> None:
+def test_two_wheelers_are_available_by_class(tmp_path: Path) -> None:
     write(tmp_path, "000001")
     write_dair_v2x_index(tmp_path, "test", [DAIRPair("000001", "b", 0.0)])
     frame = DAIRV2X(tmp_path, "test", classes={"motorcyclist"})["b"][0]
@@ -107,7 +107,7 @@ def test_frames_are_added_to_what_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_points", [True, False])
-def test_the_files_of_a_frame_are_all_that_is_written(with_points: bool, tmp_path: Path) -> None:
+def test_only_the_files_of_a_frame_are_written(with_points: bool, tmp_path: Path) -> None:
     write(tmp_path, "000001", with_points=with_points)
     files = dair_v2x_frame_files(tmp_path, "000001", with_points)
     assert sorted(files) == sorted(path for path in tmp_path.rglob("*") if path.is_file())

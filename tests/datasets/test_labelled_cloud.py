@@ -31,7 +31,7 @@ def test_points_in_a_box(
     assert count_points(points, Boxes([(10, 0, 0)], [size], [yaw])).tolist() == [count]
 
 
-def test_points_at_a_box_come_in_its_axes_and_at_any_height() -> None:
+def test_points_at_box_use_its_axes_without_height() -> None:
     points = np.array([[10, 1.5, 7, 0], [8.95, 0, 0, 0], [8.4, 0, 0, 0], [50, 0, 0, 0]], dtype=np.float32)
     across = Boxes([(10, 0, 1)], [(4, 2, 1.5)], [math.pi / 2])  # faces along y
     ((rows, found),) = points_at(points, across)

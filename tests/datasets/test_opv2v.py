@@ -84,7 +84,7 @@ def test_an_object_by_hand(
     assert np.linalg.det(world_SE3_lidar[:3, :3]) == pytest.approx(1.0)
 
 
-def test_a_pose_stored_as_a_matrix_is_the_same_pose(tmp_path: Path) -> None:
+def test_matrix_pose_equals_vector_pose(tmp_path: Path) -> None:
     pose = [10.0, -5.0, 1.9, 1.0, 30.0, -2.0]
     left_handed = SE3_from_carla(pose) * np.outer([1, -1, 1, 1], [1, -1, 1, 1])
     six, _ = read_opv2v_labels(write_yaml(tmp_path / "1.yaml", pose, {}))
@@ -165,7 +165,7 @@ def test_scenarios_agents_and_frames_are_found_in_order(tmp_path: Path) -> None:
     assert frames[0].agents["641"].points is None  # there is no cloud
 
 
-def test_roadside_units_of_v2xset_come_last_and_are_marked(tmp_path: Path) -> None:
+def test_v2xset_roadside_units_come_last(tmp_path: Path) -> None:
     tree(tmp_path, "test/a/-1/000000", "test/a/641/000000", "test/a/-2/000000", "test/a/1000/000000")
     agents = V2XSet(tmp_path, "test")["a"][0].agents
     assert list(agents) == ["1000", "641", "-1", "-2"]
@@ -198,7 +198,7 @@ def test_a_scenario_is_a_sequence(tmp_path: Path) -> None:
         scenario[3]
 
 
-def test_nothing_is_read_before_it_is_used_and_then_once(tmp_path: Path) -> None:
+def test_files_are_read_lazily_and_once(tmp_path: Path) -> None:
     folder = tree(tmp_path, "test/a/1/000000") / "test" / "a" / "1"
     (folder / "000000.pcd").write_text("broken")
     (folder / "000000.yaml").write_text("lidar_pose: [")
@@ -246,13 +246,13 @@ def test_a_split_that_is_not_there(tmp_path: Path, split: str, error: type[Excep
         OPV2V(tmp_path, split)
 
 
-def test_a_scenario_that_is_not_there_names_the_nearest(tmp_path: Path) -> None:
+def test_missing_scenario_error_names_nearest(tmp_path: Path) -> None:
     data = OPV2V(tree(tmp_path, "test/TwoCars_1/1/000000", "test/ThreeCars_1/1/000000"), "test")
     with pytest.raises(ValueError, match=r"no scenario 'TwoCars1'; did you mean 'TwoCars_1'\?"):
         data["TwoCars1"]
 
 
-def test_a_root_that_is_something_else_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_wrong_root_error_says_what_was_expected(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         OPV2V(tmp_path / "nowhere", "test")
     (tmp_path / "test").mkdir()
@@ -298,7 +298,7 @@ def test_what_is_written_is_read_again(
     np.testing.assert_array_equal(agent.points, points)
 
 
-def test_the_file_is_left_handed_and_in_degrees_as_opv2v_has_it(tmp_path: Path) -> None:
+def test_file_is_left_handed_and_in_degrees(tmp_path: Path) -> None:
     objects = Boxes([[10, 3, -1]], [[4, 2, 1.5]], [np.pi / 2], track_id=[7])
     write_opv2v_frame(tmp_path, "000068", SE3_from_carla([0, 0, 1.9, 0, 0, 0]), objects, speeds={7: 36.0})
     document = yaml.safe_load((tmp_path / "000068.yaml").read_text())
@@ -334,7 +334,7 @@ def test_the_writer_refuses_what_the_format_cannot_hold(
 # ---- the truth of a whole frame ----
 
 
-def test_ground_truth_is_the_union_by_id_without_the_ego(tmp_path: Path) -> None:
+def test_ground_truth_is_union_without_ego(tmp_path: Path) -> None:
     folder = tmp_path / "test" / "a"
     shared = {1: CAR | {"location": [10, 0, 0]}}
     write_yaml(folder / "1" / "0.yaml", [0, 0, 2, 0, 0, 0], {**shared, 20: CAR | {"location": [50, 0, 0]}})
@@ -368,7 +368,7 @@ def test_the_real_scenarios(culver_city: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["TwoCars_1", "ThreeCars_1"])
-def test_an_object_seen_by_two_agents_is_at_one_place_of_the_world(culver_city: Path, name: str) -> None:
+def test_shared_objects_coincide_in_the_world(culver_city: Path, name: str) -> None:
     compared = 0
     for frame in OPV2V(culver_city, "test_culvercity")[name][::9]:
         seen: dict[int, tuple[Any, float]] = {}
@@ -382,7 +382,7 @@ def test_an_object_seen_by_two_agents_is_at_one_place_of_the_world(culver_city: 
     assert compared > 200
 
 
-def test_the_body_of_the_other_car_is_where_its_pose_says(culver_city: Path) -> None:
+def test_other_car_box_is_at_its_pose(culver_city: Path) -> None:
     """Another agent's label of a car against that car's own LiDAR pose, half a metre behind its middle."""
     for frame in OPV2V(culver_city, "test_culvercity")["TwoCars_1"][::10]:
         car1, car2 = frame.agents["car1"], frame.agents["car2"]
@@ -397,7 +397,7 @@ def test_the_body_of_the_other_car_is_where_its_pose_says(culver_city: Path) -> 
             assert abs(wrap_angle(car1.objects.yaw[row] - heading)) < 1e-3
 
 
-def test_near_boxes_hold_points_of_the_cloud_and_mirrored_ones_hold_fewer(culver_city: Path) -> None:
+def test_boxes_hold_points_unless_mirrored(culver_city: Path) -> None:
     inside, mirrored_inside, near_objects = 0, 0, 0
     for frame in OPV2V(culver_city, "test_culvercity")["TwoCars_1"][1:14:6]:
         for agent in frame.agents.values():

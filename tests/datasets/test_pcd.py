@@ -52,7 +52,7 @@ def ascii_file(path: Path, rows: str, points: int, fields: str = "x y z rgb") ->
     return path
 
 
-def test_red_in_ascii_is_a_tiny_float_also_below_the_smallest_normal_one(tmp_path: Path) -> None:
+def test_ascii_rgb_denormal_floats_give_intensity(tmp_path: Path) -> None:
     red = np.array([3, 100, 160, 255], dtype=np.uint32)  # below 128 the packed colour is a denormal float
     rows = "".join(f"{i} 0 0 {value:.10g}\n" for i, value in enumerate((red << 16).view(np.float32).tolist()))
     np.testing.assert_allclose(read_pcd(ascii_file(tmp_path / "a.pcd", rows, 4))[:, 3], red / 255, rtol=1e-6)
@@ -109,7 +109,7 @@ def good_bytes(path: Path, encoding: Encoding) -> bytes:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.93])
-def test_a_file_cut_short_is_an_error_that_names_it(tmp_path: Path, encoding: Encoding, kept: float) -> None:
+def test_truncated_file_is_named(tmp_path: Path, encoding: Encoding, kept: float) -> None:
     path = tmp_path / "000069.pcd"
     content = good_bytes(path, encoding)
     path.write_bytes(content[: int(kept * len(content))])
@@ -142,7 +142,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_pcd(tmp_path / "a.pcd")
 
 
-def test_the_untouched_ascii_cloud_and_the_binary_one_of_the_same_frame_agree(culver_city: Path) -> None:
+def test_ascii_and_binary_clouds_agree(culver_city: Path) -> None:
     """The binary one was recovered from a crop; every point of it is one of the ASCII file, with its intensity."""
     ascii_points = read_pcd(culver_city / "raw_ascii_sample.pcd", left_handed=True)
     binary = read_pcd(culver_city / "test_culvercity" / "TwoCars_1" / "car1" / "006226.pcd", left_handed=True)

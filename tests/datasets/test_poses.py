@@ -55,7 +55,7 @@ def test_a_carla_pose_by_hand(
 
 
 @given(POSES)
-def test_mirroring_carlas_own_matrix_gives_the_same_proper_rotation(pose: FloatArray) -> None:
+def test_mirrored_carla_matrix_is_a_proper_rotation(pose: FloatArray) -> None:
     matrix = SE3_from_carla(pose)
     np.testing.assert_allclose(matrix, mirrored(carla_matrix(pose)), atol=1e-9)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
@@ -72,7 +72,7 @@ def test_the_inverse_undoes_a_pose(pose: FloatArray) -> None:
     np.testing.assert_allclose(inverse_SE3(matrix) @ matrix, np.eye(4), atol=1e-8)
 
 
-def test_boxes_move_as_in_the_plane_when_nothing_tilts() -> None:
+def test_untilted_boxes_move_as_in_the_plane() -> None:
     boxes = Boxes([[1, 2, 3], [-4, 5, 0]], [[4, 2, 1.5]] * 2, [0.3, -2.0], track_id=[7, 9])
     planar = SE2(10.0, -3.0, 2.5)
     matrix = np.eye(4)
@@ -107,7 +107,7 @@ def test_rounding_in_a_stored_matrix_is_put_right() -> None:
 
 
 @pytest.mark.parametrize("agent", ["car1", "car3"])
-def test_opv2v_mounts_the_lidar_at_one_place_of_the_car_only_with_these_signs(culver_city: Path, agent: str) -> None:
+def test_opv2v_lidar_mount_fixes_the_signs(culver_city: Path, agent: str) -> None:
     """A wrong sign of roll or pitch moves the mount by centimetres on the slopes of this scenario."""
     files = sorted((culver_city / "test_culvercity" / "ThreeCars_1" / agent).glob("*.yaml"))[::3]
     documents = [read_yaml(file, ("lidar_pose", "true_ego_pos")) for file in files]

@@ -24,7 +24,7 @@ def load(path: Path, text: str, keys: tuple[str, ...] = ("a", "b")) -> dict[str,
 @given(
     st_numpy.arrays(st.sampled_from(["<f8", ">f8", "<f4", "<i8", "|u1"]), st_numpy.array_shapes(min_dims=0, max_dims=3))
 )
-def test_arrays_come_back_as_pyyamls_own_dumper_wrote_them(
+def test_dumped_numpy_arrays_round_trip(
     tmp_path_factory: pytest.TempPathFactory,
     array: np.ndarray,
 ) -> None:
@@ -34,7 +34,7 @@ def test_arrays_come_back_as_pyyamls_own_dumper_wrote_them(
     np.testing.assert_array_equal(document["b"], array.astype(np.float64))
 
 
-def test_column_major_arrays_and_numpy_1_names_and_scalars(tmp_path: Path) -> None:
+def test_column_major_numpy_1_and_scalars_are_read(tmp_path: Path) -> None:
     pose = np.asfortranarray(np.arange(16.0).reshape(4, 4))
     text = yaml.dump({"a": pose, "b": [np.float64(2.5), np.float32(0.5), np.int64(-3)]})
     assert "numpy._core" in text or "numpy.core" in text
@@ -44,7 +44,7 @@ def test_column_major_arrays_and_numpy_1_names_and_scalars(tmp_path: Path) -> No
         assert document["b"] == [2.5, 0.5, -3]
 
 
-def test_the_decoded_array_is_a_copy_that_can_be_written(tmp_path: Path) -> None:
+def test_decoded_array_is_writable(tmp_path: Path) -> None:
     load(tmp_path / "f.yaml", yaml.dump({"a": np.eye(2)}))["a"][0, 0] = 5.0
 
 
@@ -65,7 +65,7 @@ def test_blocks_not_asked_for_are_not_parsed(tmp_path: Path) -> None:
         "a: !!python/object/apply:numpy.load ['{hit}']",
     ],
 )
-def test_a_file_that_wants_to_run_code_is_refused(tmp_path: Path, text: str) -> None:
+def test_code_in_yaml_is_refused(tmp_path: Path, text: str) -> None:
     hit = tmp_path / "hit"
     with pytest.raises(ValueError, match=r"f\.yaml: not readable as YAML"):
         load(tmp_path / "f.yaml", text.format(hit=hit))
@@ -100,13 +100,13 @@ def test_an_array_of_objects_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["a: [1, 2", "- 1\n- 2\n", "just text", "", "a: \x00", "? [\n"])
-def test_what_is_no_mapping_is_an_error_in_one_line(tmp_path: Path, text: str) -> None:
+def test_non_mapping_is_one_error_line(tmp_path: Path, text: str) -> None:
     with pytest.raises(ValueError, match=r"f\.yaml") as error:
         load(tmp_path / "f.yaml", text)
     assert "\n" not in str(error.value)
 
 
-def test_bytes_that_are_no_text_and_a_missing_file(tmp_path: Path) -> None:
+def test_binary_and_missing_files_raise(tmp_path: Path) -> None:
     (tmp_path / "f.yaml").write_bytes(b"\xff\xfe\x00a")
     with pytest.raises(ValueError, match=r"f\.yaml"):
         read_yaml(tmp_path / "f.yaml", ("a",))

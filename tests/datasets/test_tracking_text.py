@@ -47,7 +47,7 @@ def test_a_v2v4real_detection_by_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(boxes.label, ["car"])
 
 
-def test_a_v2v4real_label_by_hand_and_mirrored_on_demand(tmp_path: Path) -> None:
+def test_v2v4real_label_by_hand_and_mirrored(tmp_path: Path) -> None:
     path = write(tmp_path / "0000.txt", V2V_LABEL)
     (boxes,) = read_v2v4real_labels(path)
     np.testing.assert_allclose(boxes.center, [[-20.5, 3.0, -1.2]])
@@ -76,7 +76,7 @@ def test_a_kitti_box_by_hand(tmp_path: Path, rotation_y: float, yaw: float, why:
     np.testing.assert_allclose(boxes.yaw, [yaw], atol=1e-12, err_msg=why)
 
 
-def test_a_kitti_detection_is_the_same_box_as_a_label(tmp_path: Path) -> None:
+def test_kitti_detection_equals_label_format(tmp_path: Path) -> None:
     (detected,) = read_kitti_detections(write(tmp_path / "a.txt", KITTI_DETECTION))
     (labelled,) = read_kitti_labels(write(tmp_path / "b.txt", KITTI_LABEL))
     np.testing.assert_allclose(detected.center, labelled.center)
@@ -95,9 +95,7 @@ def test_only_the_classes_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("reader", "line"), READERS)
-def test_frames_without_boxes_are_empty_and_their_number_can_be_given(
-    tmp_path: Path, reader: Reader, line: str
-) -> None:
+def test_frames_without_boxes_are_empty(tmp_path: Path, reader: Reader, line: str) -> None:
     path = write(tmp_path / "a.txt", line.replace("0", "1", 1), "", line.replace("0", "4", 1))
     assert [len(boxes) for boxes in reader(path)] == [0, 1, 0, 0, 1]
     assert [len(boxes) for boxes in reader(path, frame_count=6)] == [0, 1, 0, 0, 1, 0]  # type: ignore[call-arg]
@@ -141,7 +139,7 @@ def test_an_unknown_type_of_detection_is_named(tmp_path: Path, reader: Reader) -
 
 
 @pytest.mark.parametrize(("reader", "line"), [READERS[1], READERS[3]])
-def test_a_track_twice_in_a_frame_names_both_lines(tmp_path: Path, reader: Reader, line: str) -> None:
+def test_repeated_track_in_frame_names_both_lines(tmp_path: Path, reader: Reader, line: str) -> None:
     with pytest.raises(ValueError, match=r"a\.txt:3: track 17 is in frame 0 already, line 1"):
         reader(write(tmp_path / "a.txt", line, line.replace("17", "18"), line))
     with pytest.raises(ValueError, match=r"a\.txt:1: the track id must be an integer, got '17\.5'"):
@@ -185,7 +183,7 @@ def test_every_real_file_is_read(real_data: Path) -> None:
         assert len(read_kitti_labels(path)) >= len(detections) > 0
 
 
-def test_v2v4real_oncoming_cars_pass_on_the_left_as_in_the_country_of_the_recording(real_data: Path) -> None:
+def test_v2v4real_oncoming_cars_pass_on_the_left(real_data: Path) -> None:
     """Right-hand traffic tells left from right; so y is to the left in these files, and nothing must be mirrored."""
     left = {"oncoming": 0, "overtaken": 0}
     right = {"oncoming": 0, "overtaken": 0}
@@ -207,7 +205,7 @@ def test_v2v4real_oncoming_cars_pass_on_the_left_as_in_the_country_of_the_record
     assert right["overtaken"] > 5 * left["overtaken"]
 
 
-def test_v2v4real_detections_of_both_cars_lie_on_the_labels(real_data: Path) -> None:
+def test_v2v4real_detections_match_labels(real_data: Path) -> None:
     """Both are in the ego frame: columns, signs and the frame offset are right or the boxes would not meet."""
     folder = real_data / "v2v4real_detections" / "val"
     labels = read_v2v4real_labels(folder / "labels" / "0005.txt")

@@ -75,7 +75,7 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_objects_are_in_the_agents_own_frame_and_poses_are_matrices(scene: Path) -> None:
+def test_objects_are_in_agent_frame_with_matrix_poses(scene: Path) -> None:
     frame = V2V4Real(scene, "test")["testoutput_CAV_data_2022-03-15-09-54-40_0"][0]
     objects = frame.agents["0"].objects
     np.testing.assert_allclose(objects.center, [[10, 3, -1.2], [40, 0, -1.2], [0, -9, -1.2]])
@@ -84,7 +84,7 @@ def test_objects_are_in_the_agents_own_frame_and_poses_are_matrices(scene: Path)
     np.testing.assert_allclose(frame.agents["1"].world_SE3_lidar, pose(140, 50, np.pi), atol=1e-12)
 
 
-def test_an_associated_object_has_one_id_and_one_place_for_both_agents(scene: Path) -> None:
+def test_associated_object_has_one_id_and_place(scene: Path) -> None:
     agents = V2V4Real(scene, "test")["testoutput_CAV_data_2022-03-15-09-54-40_0"][1].agents
     world = {name: transform_boxes(agent.objects, agent.world_SE3_lidar) for name, agent in agents.items()}
     row0, row1 = (ids(world[name]).index(5) for name in "01")
@@ -107,7 +107,7 @@ def test_pedestrians_are_skipped_and_types_kept(scene: Path) -> None:
     np.testing.assert_array_equal(agents["1"].objects.label, ["car", "car", "truck"])
 
 
-def test_the_ego_is_in_the_truth_of_the_others_only(scene: Path) -> None:
+def test_ego_is_in_others_ground_truth_only(scene: Path) -> None:
     frame = V2V4Real(scene, "test")["testoutput_CAV_data_2022-03-15-09-54-40_0"][0]
     assert ids(frame.ground_truth("0")) == [
         5,
@@ -140,7 +140,7 @@ def test_left_handed_reading_mirrors_boxes_pose_and_points(scene: Path) -> None:
     assert np.linalg.det(turned.world_SE3_lidar[:3, :3]) == pytest.approx(1.0)
 
 
-def test_values_dumped_as_arrays_and_numpy_numbers_are_read(tmp_path: Path) -> None:
+def test_dumped_arrays_and_numpy_numbers_are_read(tmp_path: Path) -> None:
     entry = vehicle(
         1.0,
         2.0,
@@ -154,7 +154,7 @@ def test_values_dumped_as_arrays_and_numpy_numbers_are_read(tmp_path: Path) -> N
     assert ids(objects) == [4]
 
 
-def test_a_second_object_with_the_same_association_keeps_its_own_id(tmp_path: Path) -> None:
+def test_repeated_association_keeps_own_id(tmp_path: Path) -> None:
     path = write_frame(
         tmp_path, "000000", pose(0, 0, 0), {1: vehicle(1, 2, 0, ass_id=4), 2: vehicle(9, 2, 0, ass_id=4)}
     )

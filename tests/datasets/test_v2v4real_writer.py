@@ -60,7 +60,7 @@ def test_what_is_written_is_read_back(left_handed: bool, tmp_path: Path) -> None
         np.testing.assert_array_equal(read.objects[order].label, OBJECTS.label)
 
 
-def test_the_pose_is_a_numpy_array_as_numpy_1_dumps_it(tmp_path: Path) -> None:
+def test_pose_is_dumped_as_numpy_1_array(tmp_path: Path) -> None:
     """The data set's own tools take a list for six numbers of a pose."""
     text = (written(tmp_path) / "0" / "000000.yaml").read_text()
     assert "numpy.core.multiarray._reconstruct" in text

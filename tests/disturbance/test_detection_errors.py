@@ -33,7 +33,7 @@ def detect(boxes: Boxes, seed: int = 0, **levels: Any) -> tuple[Boxes, np.ndarra
     return add_detection_errors(boxes, errors, np.random.default_rng([seed, 0, 0]))
 
 
-def test_a_perfect_detector_returns_the_truth_with_scores_and_without_identities() -> None:
+def test_perfect_detector_returns_truth_with_scores() -> None:
     boxes = ring(9)
     found, rows = detect(boxes)
     assert sorted(rows) == list(range(9))
@@ -63,7 +63,7 @@ def test_a_perfect_detector_returns_the_truth_with_scores_and_without_identities
         ({"size_std": (0.0, 0.0, 0.2)}, "h", 0.2, "the third is the height"),
     ],
 )
-def test_each_level_is_the_standard_deviation_of_its_own_error(
+def test_each_level_is_its_error_standard_deviation(
     levels: dict[str, Any], error_of: str, expected: float, why: str
 ) -> None:
     boxes = ring(4000)
@@ -75,13 +75,13 @@ def test_each_level_is_the_standard_deviation_of_its_own_error(
     assert abs(error[error_of].mean()) <= 0.1 * expected + 1e-9, "errors have no bias"
 
 
-def test_missed_is_the_fraction_of_objects_that_are_not_detected() -> None:
+def test_missed_is_the_share_of_undetected_objects() -> None:
     found, rows = detect(ring(4000), missed=0.25)
     assert len(found) / 4000 == pytest.approx(0.75, abs=0.03)
     assert len(set(rows)) == len(rows)
 
 
-def test_flipped_turns_that_fraction_of_headings_by_half_a_turn() -> None:
+def test_flipped_is_the_share_of_reversed_headings() -> None:
     boxes = ring(4000)
     found, rows = detect(boxes, flipped=0.1)
     turn = np.abs(wrap_angle(found.yaw - boxes.yaw[rows]))
@@ -89,7 +89,7 @@ def test_flipped_turns_that_fraction_of_headings_by_half_a_turn() -> None:
     assert (turn > 1).mean() == pytest.approx(0.1, abs=0.02)
 
 
-def test_false_boxes_come_at_their_rate_within_their_range_and_score_lower() -> None:
+def test_false_boxes_have_rate_range_and_lower_scores() -> None:
     counts, distances = [], []
     for seed in range(300):
         found, rows = detect(ring(3), seed=seed, false_per_frame=2.0, false_range=30.0)
@@ -105,21 +105,21 @@ def test_false_boxes_come_at_their_rate_within_their_range_and_score_lower() -> 
     assert np.mean(np.array(distances) < 30.0 / math.sqrt(2)) == pytest.approx(0.5, abs=0.06), "even over the area"
 
 
-def test_detections_are_sorted_by_score_as_a_detector_gives_them() -> None:
+def test_detections_are_sorted_by_score() -> None:
     found, _ = detect(ring(50), false_per_frame=5.0, score_std=0.2)
     assert found.score is not None
     assert (np.diff(found.score) <= 0).all()
     assert ((found.score >= 0.05) & (found.score <= 1.0)).all()
 
 
-def test_sizes_stay_valid_and_an_unknown_height_stays_unknown() -> None:
+def test_sizes_stay_valid_and_unknown_heights_unknown() -> None:
     boxes = ring(500).replace(size=np.tile([0.5, 0.3, 0.0], (500, 1)))
     found, _ = detect(boxes, size_std=(1.0, 1.0, 1.0))
     assert (found.size[:, :2] > 0).all()
     assert (found.size[:, 2] == 0).all()
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not() -> None:
+def test_same_seed_gives_same_bytes() -> None:
     first, rows = add_detection_errors(ring(20), DetectionErrors(), np.random.default_rng([1, 2, 3]))
     again, rows_again = add_detection_errors(ring(20), DetectionErrors(), np.random.default_rng([1, 2, 3]))
     other, _ = add_detection_errors(ring(20), DetectionErrors(), np.random.default_rng([1, 2, 4]))
@@ -128,7 +128,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not() -> None:
     assert first.center.tobytes() != other.center.tobytes()
 
 
-def test_changing_one_level_leaves_the_other_errors_of_the_same_seed_alone() -> None:
+def test_levels_are_independent_for_the_same_seed() -> None:
     few, few_rows = detect(ring(30), center_std=0.3, missed=0.5)
     all_, all_rows = detect(ring(30), center_std=0.3, missed=0.0, flipped=0.5)
     by_row = dict(zip(all_rows.tolist(), all_.center.tolist(), strict=True))
@@ -163,6 +163,6 @@ def test_nothing_in_and_no_errors_is_nothing_out() -> None:
         ({"centre_std": 0.1}, "centre_std"),
     ],
 )
-def test_a_level_that_makes_no_sense_is_an_error_that_names_the_field(levels: dict[str, Any], field: str) -> None:
+def test_invalid_level_is_named(levels: dict[str, Any], field: str) -> None:
     with pytest.raises(ValidationError, match=field):
         DetectionErrors(**levels)

@@ -16,7 +16,7 @@ from .drives import KEY, drive
 FRAMES = drive()
 
 
-def test_noise_has_the_asked_spread_in_x_y_and_yaw_and_leaves_the_rest() -> None:
+def test_noise_has_the_set_spread_in_plane_only() -> None:
     frames, noise = drive(600), LocalisationNoise(position=1.5, yaw=2.5)
     errors = []
     for index, now in enumerate(frames):
@@ -30,7 +30,7 @@ def test_noise_has_the_asked_spread_in_x_y_and_yaw_and_leaves_the_rest() -> None
     assert np.abs([z, roll, pitch]).max() < 1e-9
 
 
-def test_noise_is_on_the_ego_too_and_new_in_every_moment_and_of_every_agent() -> None:
+def test_noise_is_independent_per_frame_and_agent() -> None:
     noise = LocalisationNoise(position=1.0, yaw=1.0)
     shifts = [
         float(noise.apply(FRAMES, index, "ego", KEY).claimed[agent][0, 3] - FRAMES[index].true[agent][0, 3])
@@ -41,7 +41,7 @@ def test_noise_is_on_the_ego_too_and_new_in_every_moment_and_of_every_agent() ->
     assert all(shifts)
 
 
-def test_the_same_key_gives_the_same_noise_at_every_level_but_for_its_size() -> None:
+def test_noise_scales_with_level_for_same_key() -> None:
     def shift(level: float, key: tuple[int, ...] = KEY) -> float:
         heard = LocalisationNoise(position=level, yaw=level).apply(FRAMES, 4, "ego", key)
         return float(heard.claimed["car2"][1, 3] - FRAMES[4].true["car2"][1, 3])
@@ -51,13 +51,13 @@ def test_the_same_key_gives_the_same_noise_at_every_level_but_for_its_size() -> 
     assert shift(0.5) != shift(0.5, (8, 3)) != shift(0.5, (7, 4))
 
 
-def test_noise_of_one_agent_does_not_depend_on_who_else_is_there() -> None:
+def test_noise_is_independent_of_other_agents() -> None:
     noise = LocalisationNoise()
     alone = noise.apply([frame.without("car2") for frame in FRAMES], 3, "ego", KEY)
     np.testing.assert_array_equal(alone.claimed["car3"], noise.apply(FRAMES, 3, "ego", KEY).claimed["car3"])
 
 
-def test_under_the_attack_everyone_is_where_the_ego_is() -> None:
+def test_attacked_agents_claim_the_ego_pose() -> None:
     heard = SamePlace().apply(FRAMES, 5, "ego", KEY)
     for claimed in heard.claimed.values():
         np.testing.assert_array_equal(claimed, FRAMES[5].true["ego"])
@@ -67,18 +67,18 @@ def test_under_the_attack_everyone_is_where_the_ego_is() -> None:
     ("index", "x"),
     [(0, 0.0), (4, 0.0), (10, 0.0), (15, 5.0)],
 )
-def test_a_replayed_pose_is_a_second_old_or_the_first_there_is(index: int, x: float) -> None:
+def test_replayed_pose_is_one_second_old(index: int, x: float) -> None:
     heard = ReplayedPose(seconds=1.0).apply(FRAMES, index, "ego", KEY)
     assert heard.claimed["car2"][0, 3] == x
     np.testing.assert_array_equal(heard.claimed["ego"], FRAMES[index].true["ego"])
 
 
-def test_a_replayed_pose_of_an_agent_that_came_late_is_its_first() -> None:
+def test_replayed_pose_of_late_agent_is_its_first() -> None:
     frames = [frame.without("car2") if i < 12 else frame for i, frame in enumerate(FRAMES)]
     assert ReplayedPose(seconds=1.0).apply(frames, 15, "ego", KEY).claimed["car2"][0, 3] == 12.0
 
 
-def test_an_offset_is_the_same_in_the_collaborators_own_frame() -> None:
+def test_offset_is_constant_in_collaborator_frame() -> None:
     for index in (0, 9):
         heard = OffsetPose(x=3.0, y=-2.0, yaw=10.0).apply(FRAMES, index, "ego", KEY)
         true = FRAMES[index].true
@@ -118,6 +118,6 @@ def test_undisturbed_is_as_it_was() -> None:
         ("fabricated", {"count": -1}, "count"),
     ],
 )
-def test_what_does_not_exist_or_is_out_of_range_is_named(name: str, options: dict[str, float], message: str) -> None:
+def test_unknown_or_out_of_range_setting_is_named(name: str, options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         disturbance(name, **options)

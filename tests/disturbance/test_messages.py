@@ -27,7 +27,7 @@ def test_fabricated_boxes_are_added_behind_the_true_ones() -> None:
         assert view.features is before.features
 
 
-def test_fabricated_boxes_stay_with_their_collaborator_and_keep_their_ids() -> None:
+def test_fabricated_boxes_keep_ids_and_follow_their_agent() -> None:
     attack = FabricatedBoxes(count=4)
     first, later = (attack.apply(FRAMES, index, "ego", KEY).observations for index in (0, 9))
     np.testing.assert_array_equal(first["car2"].boxes.center[2:], later["car2"].boxes.center[2:])
@@ -37,7 +37,7 @@ def test_fabricated_boxes_stay_with_their_collaborator_and_keep_their_ids() -> N
     assert (first["car2"].boxes.center[2:] != first["car3"].boxes.center[2:]).any()
 
 
-def test_fabricated_boxes_can_be_sent_and_are_sorted_among_the_detections() -> None:
+def test_fabricated_boxes_are_sendable_and_sorted() -> None:
     view = FabricatedBoxes(count=3).apply(FRAMES, 0, "ego", KEY).observations["car2"]
     assert view.detections.score is not None
     assert view.detections.score.tolist() == [0.9, 0.9, 0.9, 0.8, 0.4]
@@ -66,7 +66,7 @@ def test_loss_drops_whole_collaborators_this_often(probability: float, there: in
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.0, 0), (0.1, 1), (0.25, 3), (0.3, 3)])
-def test_late_messages_tell_what_was_seen_and_from_where_then(seconds: float, frames: int) -> None:
+def test_late_messages_carry_old_observations_and_poses(seconds: float, frames: int) -> None:
     heard, now, then = Delay(seconds=seconds).apply(FRAMES, 8, "ego", KEY), FRAMES[8], FRAMES[8 - frames]
     assert heard.observations["ego"] is now.observations["ego"]
     assert heard.observations["car2"] is then.observations["car2"]
@@ -75,12 +75,12 @@ def test_late_messages_tell_what_was_seen_and_from_where_then(seconds: float, fr
     assert heard.time == now.time
 
 
-def test_before_the_first_late_message_there_is_only_the_ego() -> None:
+def test_before_first_late_message_ego_is_alone() -> None:
     heard = Delay(seconds=0.3).apply(FRAMES, 2, "ego", KEY)
     assert list(heard.observations) == list(heard.claimed) == list(heard.true) == ["ego"]
 
 
-def test_a_collaborator_that_has_just_come_is_heard_late_and_one_that_left_is_not() -> None:
+def test_late_messages_respect_arrival_and_departure() -> None:
     came = [frame.without("car3") if i < 5 else frame for i, frame in enumerate(FRAMES)]
     assert "car3" not in Delay(seconds=0.2).apply(came, 6, "ego", KEY).observations
     assert "car3" in Delay(seconds=0.2).apply(came, 7, "ego", KEY).observations

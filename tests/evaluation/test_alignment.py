@@ -87,7 +87,7 @@ def test_summary_of_nothing_has_no_shares() -> None:
     assert all(math.isnan(v) for v in (summary.right, summary.wrong_of_accepted, summary.median_milliseconds))
 
 
-def test_groups_by_co_visible_objects_overlap_as_they_are_named() -> None:
+def test_co_visible_groups_overlap_as_named() -> None:
     groups = by_co_visible([record(co_visible=k) for k in (0, 1, 1, 2, 3, 4, 9)])
     assert {name: group.frames for name, group in groups.items()} == {
         "all": 7,
@@ -157,7 +157,7 @@ def test_real_cars_with_nothing_in_common_never_meet() -> None:
 
 
 @needs_data
-def test_agents_of_opv2v_find_each_other_through_detection_errors() -> None:
+def test_opv2v_agents_align_despite_detection_errors() -> None:
     labels = OPV2V(DATA / "opv2v", "test_culvercity")
     records = [r for s in noisy_label_sequences(labels, DetectionErrors()) for r in evaluate([s], BEVGlue)]
     summary = summarise([r for r in records if r.co_visible >= 4], off_by_3)

@@ -136,7 +136,7 @@ def test_objects_with_few_points_are_ignored(
     assert report.ap(0.5) == pytest.approx(ap, nan_ok=True)
 
 
-def test_a_detection_takes_a_counted_object_before_it_is_dropped_for_an_ignored_one() -> None:
+def test_evaluated_object_is_matched_before_ignored_one() -> None:
     truth = cars(A, (10.5, 0.0))
     scene = prepare(DetectionFrame(cars((10.4, 0.0), (10.4, 0.0), score=[0.9, 0.8]), truth, np.array([9, 0])), None, 1)
     assert match(scene, 0.5).tolist() == [0, DROPPED]
@@ -166,7 +166,7 @@ def test_the_borders_belong_to_the_range() -> None:
     assert (report.overall.truth, report.detections_outside) == (2, 0)
 
 
-def test_range_bins_go_by_the_object_where_there_is_one() -> None:
+def test_range_bins_use_the_matched_object() -> None:
     # A true detection at 30.2 m of an object at 29.9 m, a missed object at 30 m, and a false detection at 60 m.
     one = frame([(29.9, 0.0), (0.0, 30.0)], ((30.2, 0.0), 0.9), ((-60.0, 0.0), 0.8))
     report = evaluate_detections([one])
@@ -243,7 +243,7 @@ def test_what_cannot_be_evaluated_is_named(make: object, said: str) -> None:
         make()  # type: ignore[operator]
 
 
-def test_failures_are_what_was_missed_and_what_was_made_up() -> None:
+def test_failures_list_missed_and_false_detections() -> None:
     detections = cars(NOWHERE, A, A, (20.0, 1.5), (40.0, 0.2), score=[0.8, 0.9, 0.7, 0.6, 0.1])
     one = DetectionFrame(
         detections, cars(A, B, C, label="car"), np.array([9, 8, 7]), "s/1", "car1", np.array([1, 9, 9, 4, 0])

@@ -46,9 +46,7 @@ def test_one_command_writes_a_report_that_says_which(
     ]
 
 
-def test_json_has_every_table_and_nothing_else_is_printed(
-    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_has_every_table_and_nothing_else(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(tiny, tmp_path, "--tables", "communication", "--frames", "1", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert [table["name"] for table in document["tables"]["opv2v test"]] == ["communication"]
@@ -83,7 +81,7 @@ def test_a_second_data_set_stands_beside(tiny: Path, tmp_path: Path, capsys: pyt
         (("--real", "/nowhere"), "no folder /nowhere"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(
+def test_bad_input_is_one_line_and_exits_2(
     tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], message: str
 ) -> None:
     assert reproduce(tiny, tmp_path / "out", "--tables", "communication", *words) == 2

@@ -49,7 +49,7 @@ def test_average_precision_is_over_all_frames_together() -> None:
     assert made.ap(CONDITION, 0.7) == pytest.approx(0.75)
 
 
-def test_what_is_outside_or_hardly_hit_does_not_count() -> None:
+def test_outside_or_barely_hit_objects_are_ignored() -> None:
     found = cars(0, 60, score=0.9)
     assert results((cars(0, 60), found, ())).ap(CONDITION, 0.5) == 1.0
     assert results((cars(0, 60), found, ())).object_count == 1
@@ -57,7 +57,7 @@ def test_what_is_outside_or_hardly_hit_does_not_count() -> None:
     assert results((cars(0), found, ()), points=4).object_count == 0
 
 
-def test_precision_can_be_looked_at_on_some_frames_only() -> None:
+def test_precision_may_use_a_subset_of_frames() -> None:
     made = results((cars(0), cars(0, score=0.9), ()), (cars(0), cars(20, score=0.9), ()))
     assert made.ap(CONDITION, 0.5) == 0.5
     assert made.ap(CONDITION, 0.5, every=2) == 1.0
@@ -73,7 +73,7 @@ def test_bytes_are_of_one_collaborator_in_one_frame() -> None:
     assert alone.lonely_frames == 1
 
 
-def test_times_are_medians_and_of_perception_those_of_one_cloud() -> None:
+def test_times_are_medians_per_cloud() -> None:
     company = (heard("a", 0.1, 0.1),)
     made = results(*[(cars(0), cars(score=0.5), company)] * 3)
     assert made.milliseconds(CONDITION) == pytest.approx({"fusion": 20.0})

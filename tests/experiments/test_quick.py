@@ -52,6 +52,6 @@ def test_it_pays_to_see_together(tables: dict[str, Rows]) -> None:
     assert given["2.5/2.5"] < given["0.0/0.0"] - 0.02
 
 
-def test_bevglue_adds_next_to_nothing_to_what_is_sent(tables: dict[str, Rows]) -> None:
+def test_bevglue_adds_few_bytes(tables: dict[str, Rows]) -> None:
     row = tables["communication"]["CoBEVGlue"]
     assert 0.0 < row["bytes for alignment"] < 1e-3 * row["bytes"]

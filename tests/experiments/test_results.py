@@ -90,7 +90,7 @@ def test_a_drive_without_a_frame_reads_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "other"])
-def test_a_file_that_is_damaged_or_of_something_else_is_named(tmp_path: Path, damage: str) -> None:
+def test_damaged_or_foreign_file_is_named(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "one.npz"
     write_result(path, result())
     if damage == "cut":

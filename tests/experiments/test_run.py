@@ -82,7 +82,7 @@ def test_pose_errors_are_those_of_the_noise(settings: StudySettings) -> None:
     assert heard.accepted
 
 
-def test_the_truth_is_the_union_with_the_points_of_all(settings: StudySettings) -> None:
+def test_ground_truth_is_union_with_all_points(settings: StudySettings) -> None:
     result = run(settings, [ALONE])
     for truth in result.truth:
         assert len(truth.objects) == len(CARS)
@@ -92,14 +92,14 @@ def test_the_truth_is_the_union_with_the_points_of_all(settings: StudySettings) 
     assert result.scenario == "a_pair"
 
 
-def test_an_agent_that_comes_late_takes_part_from_then_on(settings: StudySettings) -> None:
+def test_late_agent_takes_part_from_arrival(settings: StudySettings) -> None:
     result = run(settings, [OURS, CLEAN], number=1)
     heard = [[one.agent for one in frame.heard] for frame in result.conditions[CLEAN.key].frames.values()]
     assert heard == [["2"], ["2", "3"], ["2", "3"]]
     assert [list(truth.co_visible) for truth in result.truth] == heard
 
 
-def test_agents_come_and_go_and_frames_without_the_ego_are_left_out(tiny: Path, tmp_path: Path) -> None:
+def test_agents_come_and_go_and_egoless_frames_drop(tiny: Path, tmp_path: Path) -> None:
     folder = tmp_path / "data" / "test" / "drive"
     write_agent(folder, 1, range(3))
     write_agent(folder, 1, range(4, 5))
@@ -151,9 +151,7 @@ def test_conditions_can_be_run_on_some_frames_only(settings: StudySettings) -> N
     assert numbers(result.conditions[some.key]) == numbers(result.conditions[CLEAN.key])[::2]
 
 
-def test_a_long_drive_is_the_same_in_several_blocks(
-    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_sequence_is_independent_of_blocks(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for agent in (1, 2):
         write_agent(tmp_path / "data" / "test" / "drive", agent, range(9))
     settings = tiny_settings(tiny, root=str(tmp_path / "data"))
@@ -203,7 +201,7 @@ def test_a_message_is_made_once_for_a_view(settings: StudySettings) -> None:
     assert method.made == 3
 
 
-def test_the_evaluation_range_is_whole_metres_inside_of_what_is_seen(settings: StudySettings) -> None:
+def test_evaluation_range_is_whole_metres_inside_detector(settings: StudySettings) -> None:
     assert Models(settings).evaluation_range == (-12.0, 12.0, -12.0, 12.0)
     models = Models(settings)
     from cobevglue.perception import CONFIGS

@@ -67,7 +67,7 @@ def test_an_interrupted_run_goes_on(settings: StudySettings, whole: list[Scenari
     assert progress[-1] == pytest.approx((39.0, 39.0))  # three frames, with perception and three conditions
 
 
-def test_what_is_there_is_not_run_again_and_what_is_new_is(settings: StudySettings, tmp_path: Path) -> None:
+def test_finished_conditions_are_not_run_again(settings: StudySettings, tmp_path: Path) -> None:
     run_study(settings, CONDITIONS[:2], tmp_path)
     progress: list[float] = []
     assert run_study(settings, CONDITIONS[:2], tmp_path, progress=lambda *now: progress.extend(now))
@@ -80,7 +80,7 @@ def test_what_is_there_is_not_run_again_and_what_is_new_is(settings: StudySettin
     assert not progress
 
 
-def test_more_drives_of_the_same_study_go_on_in_its_folder(settings: StudySettings, tmp_path: Path) -> None:
+def test_more_sequences_continue_in_the_same_folder(settings: StudySettings, tmp_path: Path) -> None:
     one = settings.model_copy(update={"scenarios": 1})
     assert len(run_study(one, CONDITIONS[:1], tmp_path)) == 1
     assert len(run_study(settings, CONDITIONS[:1], tmp_path)) == 2
@@ -119,7 +119,7 @@ def test_only_what_has_other_weights_is_run_anew(tmp_path: Path) -> None:
     assert before[0].conditions[key].fingerprint != after[0].conditions[key].fingerprint
 
 
-def test_another_detector_of_the_same_name_is_another_study(tmp_path: Path) -> None:
+def test_other_detector_of_same_name_restarts_study(tmp_path: Path) -> None:
     tiny_tree(tmp_path / "data", frames=1)
     file = tiny_detector(tmp_path)
     run_study(tiny_settings(tmp_path), CONDITIONS, tmp_path / "drives")

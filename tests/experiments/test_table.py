@@ -32,7 +32,7 @@ def test_markdown_has_title_rows_and_notes() -> None:
     ]
 
 
-def test_csv_has_all_digits_and_empty_cells_for_what_is_missing() -> None:
+def test_csv_has_all_digits_and_empty_cells() -> None:
     rows = list(csv.reader(io.StringIO(TABLE.to_csv())))
     assert rows == [["method", "AP@0.5", "bytes"], ["CoBEVGlue", "0.95812345", "2813211"], ["a | b\nc", "", ""]]
 

@@ -59,7 +59,7 @@ def test_a_table_needs_only_what_it_asked_for(results: Results, experiment: obje
     assert all(table.rows and table.to_markdown() and table.to_csv() for table in tables)
 
 
-def test_table_1_has_every_method_and_the_rows_that_compare(results: Results) -> None:
+def test_table_1_has_every_method_and_reference(results: Results) -> None:
     made = table(results, "noise", "noise_ap0.5")
     titles = [row[0] for row in made.rows]
     assert titles[: len(FUSION_METHODS)] == [method_title(name) for name in FUSION_METHODS]
@@ -77,7 +77,7 @@ def test_cobevglue_is_really_run_at_every_level() -> None:
 
 
 @pytest.mark.parametrize("dataset", ["opv2v", "dair-v2x", "v2v4real"])
-def test_the_papers_figure_stands_beside_on_its_data_sets(results: Results, dataset: str) -> None:
+def test_paper_figures_appear_on_its_data_sets(results: Results, dataset: str) -> None:
     made = table(results, "noise", "noise_ap0.7", dataset)
     assert list(made.columns) == ["method", "poses from", "0.0/0.0", "paper 0.0/0.0", "2.5/2.5", "paper 2.5/2.5"]
     beside = {row[0]: (row[3], row[5]) for row in made.rows}
@@ -102,7 +102,7 @@ def test_table_2_is_without_and_with_bevglue(results: Results) -> None:
     assert added == pytest.approx(100 * results.alignment_bytes(condition) / results.payload_bytes(condition))
 
 
-def test_registration_tries_every_aligner_of_points_at_every_budget() -> None:
+def test_registration_runs_every_aligner_and_budget() -> None:
     conditions = EXPERIMENTS["registration"].conditions(FULL)
     for aligner in FULL.registrations:
         run = [condition for condition in conditions if condition.aligner == aligner]
@@ -173,7 +173,7 @@ def test_an_unknown_table_is_named_with_the_nearest() -> None:
     assert [experiment.name for experiment in experiments_named(["time", "noise"])] == ["noise", "time"]
 
 
-def test_no_condition_is_listed_twice_and_the_full_study_is_not_larger_than_it_was() -> None:
+def test_conditions_are_unique_and_study_size_bounded() -> None:
     conditions = conditions_of(ALL, FULL)
     assert len({condition.key for condition in conditions}) == len(conditions)
     work = sum(1 / condition.every for condition in conditions)

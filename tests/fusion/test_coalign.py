@@ -29,7 +29,7 @@ def test_agents_that_agree_change_nothing() -> None:
     torch.testing.assert_close(ego_attention(x.expand(4, -1, -1, -1)), x[0])
 
 
-def test_where_an_agent_sees_nothing_its_zeros_take_part_as_in_the_paper() -> None:
+def test_uncovered_cells_take_part_as_zeros() -> None:
     ego = torch.tensor([1.0, 2.0]).view(1, 2, 1, 1)
     weight = math.exp(5.0 / math.sqrt(2.0))
     fused = ego_attention(torch.cat([ego, torch.zeros_like(ego)]))

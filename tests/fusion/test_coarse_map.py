@@ -30,7 +30,7 @@ def test_before_training_it_is_the_detector(kind: type[CoarseMapFusion]) -> None
 
 
 @every_method
-def test_a_message_is_a_quarter_of_the_cells_with_twice_the_channels(kind: type[CoarseMapFusion]) -> None:
+def test_message_has_quarter_cells_and_double_channels(kind: type[CoarseMapFusion]) -> None:
     rows, columns, _ = checks.SMALL.head_shape
     message = checks.seeded(kind, DETECTOR).message(checks.view(DETECTOR, 0))
     shapes = {name: values.shape for name, values in message.items()}
@@ -38,7 +38,7 @@ def test_a_message_is_a_quarter_of_the_cells_with_twice_the_channels(kind: type[
     assert message["map0"].dtype == np.float16
 
 
-def test_cells_of_the_map_at_stride_4_are_where_warping_takes_them_to_be() -> None:
+def test_stride_4_cells_are_where_warping_expects() -> None:
     """A map at stride 2 turned by 180 degrees, then halved, is the halved one turned."""
     with torch.inference_mode():
         down = checks.seeded(V2VNet, DETECTOR).down

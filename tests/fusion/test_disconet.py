@@ -34,7 +34,7 @@ def make_targets(samples: int) -> TargetBatch:
     return collate_targets([assign_targets(car, np.zeros(1, dtype=bool), anchors)] * samples, len(anchors))
 
 
-def test_a_cell_is_the_softmax_weighted_sum_of_the_agents_that_reach_it() -> None:
+def test_cell_is_softmax_weighted_sum_of_agents() -> None:
     method = make_method()
     maps = torch.rand(3, 8, 4, 5)
     covered = torch.ones(3, 1, 4, 5)
@@ -51,7 +51,7 @@ def test_a_cell_is_the_softmax_weighted_sum_of_the_agents_that_reach_it() -> Non
         torch.testing.assert_close(fused[:, row, column], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_gradients_are_finite_where_an_agent_does_not_reach() -> None:
+def test_gradients_are_finite_outside_coverage() -> None:
     maps = torch.rand(2, 8, 4, 5, requires_grad=True)
     covered = torch.ones(2, 1, 4, 5)
     covered[1, 0, :2] = 0.0
@@ -62,7 +62,7 @@ def test_gradients_are_finite_where_an_agent_does_not_reach() -> None:
     assert not maps.grad[1, :, :2].any()
 
 
-def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
+def test_agent_without_coverage_changes_nothing() -> None:
     method = make_method()
     ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
     heard = [checks.sent(method, near, checks.POSES[0])]
@@ -71,7 +71,7 @@ def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
     )
 
 
-def test_distillation_is_0_for_equal_maps_and_more_for_others() -> None:
+def test_distillation_loss_is_zero_for_equal_maps() -> None:
     torch.manual_seed(0)
     student, teacher = torch.randn(2, 8, 4, 5), torch.randn(2, 8, 4, 5)
     assert distillation_loss(teacher, teacher).item() == pytest.approx(0.0, abs=1e-6)
@@ -99,7 +99,7 @@ def test_the_loss_has_the_teachers_part() -> None:
     )
 
 
-def test_an_agent_alone_has_nothing_to_learn_from_a_teacher_of_its_own_weights() -> None:
+def test_single_agent_has_zero_distillation_loss() -> None:
     method = make_method()
     method.teacher = EarlyTeacher(DETECTOR)
     alone = checks.sample_of([checks.view(DETECTOR, 0)])
@@ -107,7 +107,7 @@ def test_an_agent_alone_has_nothing_to_learn_from_a_teacher_of_its_own_weights()
     assert terms["distillation"].item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_samples_whose_merged_features_are_unknown_are_not_compared() -> None:
+def test_samples_without_early_features_are_skipped() -> None:
     method, loss = make_method(), DetectionLoss(checks.SMALL)
     method.teacher = EarlyTeacher(DETECTOR)
     known, unknown = make_sample(), replace(make_sample(), early_features=None)
@@ -116,7 +116,7 @@ def test_samples_whose_merged_features_are_unknown_are_not_compared() -> None:
     assert method.loss([unknown], make_targets(1), loss)["distillation"].item() == 0.0
 
 
-def test_the_teacher_is_frozen_and_no_part_of_the_student() -> None:
+def test_teacher_is_frozen_and_not_in_student() -> None:
     method = make_method()
     names = set(method.state_dict())
     teacher = EarlyTeacher(DETECTOR).train()

@@ -45,7 +45,7 @@ def scattered(seed: int, count: int = 4000) -> Float32Array:
 # Keypoints
 
 
-def test_all_points_in_proposals_are_keypoints_while_there_are_few() -> None:
+def test_few_proposal_points_are_all_keypoints() -> None:
     points, margin = scattered(0), 0.3
     boxes = cars((3.0, 1.0, 0.7, 0.9), (4.0, 2.0, 2.0, 0.5), (-8.0, -4.0, -1.0, 0.2))
     inside = np.zeros(len(points), dtype=bool)
@@ -145,7 +145,7 @@ def test_refinements_lead_to_the_box(change: list[float], x: float, yaw: float) 
     assert math.remainder(back.yaw[0] - box.yaw[0], 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_refinements_are_in_the_proposal_s_axes_and_leave_its_facing() -> None:
+def test_refinements_are_in_proposal_axes_keeping_direction() -> None:
     proposal, box = cars((0, 0, math.pi / 2, 1)), cars((0, 1, -math.pi / 2 + 0.1, 1))
     diagonal = math.hypot(*CAR[:2])
     np.testing.assert_allclose(encode_refinement(box, proposal), [[1 / diagonal, 0, 0, 0, 0, 0, 0.1]], atol=1e-12)
@@ -201,7 +201,7 @@ def test_moving_everything_together_changes_nothing() -> None:
     torch.testing.assert_close(here, there)
 
 
-def test_before_training_scores_are_those_of_the_proposals_and_boxes_hardly_move() -> None:
+def test_initial_scores_and_boxes_are_the_proposals() -> None:
     boxes = cars((3.0, 1.0, 0.7, 0.9), (4.0, 2.0, 2.0, 0.2))
     rows, points = roi_inputs(boxes, scattered(2, 500)[:, :3].astype(np.float64))
     score, features = torch.from_numpy(np.array(boxes.score)), torch.zeros(500, 4, dtype=torch.float64)
@@ -211,7 +211,7 @@ def test_before_training_scores_are_those_of_the_proposals_and_boxes_hardly_move
     assert refinement.abs().max() < 0.05
 
 
-def test_the_second_look_learns_to_move_boxes_to_their_points() -> None:
+def test_second_stage_learns_to_refine_boxes() -> None:
     """Proposals are off by up to half a metre; points on the true boxes tell by how much."""
     rng = np.random.default_rng(0)
 
@@ -256,7 +256,7 @@ def method_with_weights(seed: int = 1) -> FPVRCNN:
     return method
 
 
-def test_features_of_keypoints_are_the_map_s_where_they_are() -> None:
+def test_keypoint_features_are_sampled_from_the_map() -> None:
     """A map that holds the coordinates of its cells' centres says of a point where it is."""
     method = method_with_weights()
     x, y = np.meshgrid(-12.8 + 0.8 * (np.arange(32) + 0.5), -6.4 + 0.8 * (np.arange(16) + 0.5))
@@ -361,7 +361,7 @@ def test_the_loss_is_that_of_scores_and_boxes() -> None:
     assert none["second_box"].item() == 0.0
 
 
-def test_two_halves_of_a_bus_both_learn_from_it() -> None:
+def test_both_halves_of_a_bus_are_trained() -> None:
     """Objects have identities, of which there must be one each: not so where an object stands for two proposals."""
     method, loss = method_with_weights(), DetectionLoss(checks.SMALL)
     halves = cars((-2.3, 0.0, 0.0, 0.9), (2.3, 0.0, 0.0, 0.8))
@@ -371,7 +371,7 @@ def test_two_halves_of_a_bus_both_learn_from_it() -> None:
     assert (int(proposals), int(right)) == (2, 2)
 
 
-def test_a_score_is_to_grow_from_0_at_a_quarter_to_1_at_three_quarters_of_overlap() -> None:
+def test_score_target_grows_from_quarter_to_three_quarters() -> None:
     seen = checks.view(DETECTOR, 0)
     method = method_with_weights()
     scores = seen.detections.score

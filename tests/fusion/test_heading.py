@@ -47,7 +47,7 @@ def test_who_is_believed(told: list[Boxes], turned: bool) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-180, 179)), max_size=4), st.integers(0, 3))
-def test_only_half_turns_are_made_and_a_second_time_none(rows: list[tuple[float, float, float]], agents: int) -> None:
+def test_boxes_are_only_reversed_and_idempotent(rows: list[tuple[float, float, float]], agents: int) -> None:
     boxes = cars(*rows)
     told = [cars((1.0, agent, 90.0 * agent), (-4.0, agent, 45.0)) for agent in range(agents)]
     once = vote_headings(boxes, told)

@@ -58,7 +58,7 @@ def matched(matching: PoseMatching, first: Tensor, second: Tensor, pose: SE2) ->
         (SE2(-1.5, 1.0, math.radians(3.0)), "all together"),
     ],
 )
-def test_a_map_that_is_out_of_place_by_little_is_brought_back(claimed: SE2, what: str) -> None:
+def test_slightly_misplaced_map_is_corrected(claimed: SE2, what: str) -> None:
     """Two views of the same map are truly in the same place, wherever one is claimed to be."""
     matching, view, pose = make_matching(), hills(), claimed
     for _ in range(4):
@@ -69,19 +69,19 @@ def test_a_map_that_is_out_of_place_by_little_is_brought_back(claimed: SE2, what
     assert heading < math.radians(0.5), what
 
 
-def test_maps_with_nothing_in_them_are_left_where_they_are() -> None:
+def test_empty_maps_are_not_moved() -> None:
     motion, _ = matched(make_matching(), torch.zeros_like(hills()), torch.zeros_like(hills()), SE2(2.0, 1.0, 0.1))
     assert motion == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
 
 
-def test_a_map_that_does_not_reach_is_left_where_it_is() -> None:
+def test_uncovered_map_is_not_moved() -> None:
     far = SE2(400.0, 0.0, 0.2)
     motion, logit = matched(make_matching(), hills(), hills(), far)
     assert motion == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
     assert math.isfinite(logit)
 
 
-def test_the_motion_is_that_of_the_points_with_weight() -> None:
+def test_motion_is_that_of_weighted_points() -> None:
     at = torch.from_numpy(np.random.default_rng(0).uniform(-40.0, 40.0, (1, 2, 5, 6)).astype(np.float32))
     x, y, yaw = 0.5, -0.2, 0.03
     moves = torch.stack([x - yaw * at[:, 1], y + yaw * at[:, 0]], dim=1)
@@ -92,7 +92,7 @@ def test_the_motion_is_that_of_the_points_with_weight() -> None:
     np.testing.assert_allclose(fitted[..., 1:], moves[..., 1:], atol=0.02)
 
 
-def test_what_a_motion_turns_about_does_not_change_where_points_go() -> None:
+def test_rotation_centre_does_not_change_moved_points() -> None:
     matching, view, claimed = make_matching(), hills(), SE2(0.8, -0.6, math.radians(2.0))
     moved, covered = warp(view, [claimed], CONFIG), coverage(view, [claimed], CONFIG)
     centre, aside = torch.zeros(1, 2), torch.tensor([[20.0, -10.0]])

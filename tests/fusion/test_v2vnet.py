@@ -49,7 +49,7 @@ def test_messages_are_those_of_all_pairs(agents: int) -> None:
     torch.testing.assert_close(method.pass_messages(states, weight), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_update_lies_between_the_state_and_the_candidate() -> None:
+def test_gru_update_lies_between_state_and_candidate() -> None:
     torch.manual_seed(0)
     update = GatedUpdate(4, 2)
     state, heard = 3.0 * torch.randn(2, 4, 5, 6), torch.randn(2, 2, 5, 6)
@@ -63,7 +63,7 @@ def test_the_update_lies_between_the_state_and_the_candidate() -> None:
     assert torch.equal(update(state, heard), state)
 
 
-def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
+def test_agent_without_coverage_changes_nothing() -> None:
     method = make_method()
     ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
     heard = [checks.sent(method, near, checks.POSES[0])]

@@ -132,7 +132,7 @@ def test_a_correction_shifts_and_turns_about_the_middle() -> None:
     assert turned.yaw == pytest.approx(0.3 + math.pi / 2)
 
 
-def test_messages_without_weight_are_not_heard_and_those_of_full_weight_are_v2vnets() -> None:
+def test_message_weights_interpolate_to_v2vnet() -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     mute, loud = with_messages_weighed(-1e4), with_messages_weighed(1e4)
     heard = [checks.sent(mute, other, checks.POSES[0])]
@@ -143,7 +143,7 @@ def test_messages_without_weight_are_not_heard_and_those_of_full_weight_are_v2vn
     checks.assert_same_boxes(loud.fuse(ego, heard), plain.fuse(ego, heard), atol=1e-6)
 
 
-def test_an_agent_whose_map_does_not_reach_changes_nothing() -> None:
+def test_agent_without_coverage_changes_nothing() -> None:
     method = make_method()
     ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
     heard = [checks.sent(method, near, checks.POSES[0])]
@@ -218,7 +218,7 @@ def test_claimed_poses_are_brought_nearer(learnt: tuple[V2VNetRobust, V2VNetRobu
     assert after_yaw < 0.4 * before_yaw
 
 
-def test_poses_that_need_no_correction_are_those_that_were_claimed() -> None:
+def test_correct_poses_stay_as_claimed() -> None:
     agents = {"ego": SE2(50.0, 20.0, 2.0), "b": SE2(53.0, 21.0, 1.7), "c": SE2(48.0, 22.0, -2.5)}
     observations = {}
     for number, (name, world_SE2_agent) in enumerate(agents.items()):

@@ -44,7 +44,7 @@ def softmax(values: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("size", [(4, 8), (5, 7), (3, 2)])  # of whole windows, reaching beyond both sides, in one
-def test_window_attention_is_that_of_a_loop_over_cells(size: tuple[int, int]) -> None:
+def test_window_attention_equals_loop_over_cells(size: tuple[int, int]) -> None:
     height, width = size
     w, heads, channels = 4, 2, 3
     module = made(WindowAttention, 5, w, heads, channels)
@@ -70,7 +70,7 @@ def test_window_attention_is_that_of_a_loop_over_cells(size: tuple[int, int]) ->
     np.testing.assert_allclose(module(torch.from_numpy(x)).detach().numpy(), expected, atol=1e-10)
 
 
-def test_agent_attention_is_that_of_a_loop_over_cells() -> None:
+def test_agent_attention_equals_loop_over_cells() -> None:
     module = made(AgentAttention, 6, 2)
     x = random_map(3, 2, 2, 6)
     present = np.ones((3, 2, 2), dtype=bool)
@@ -90,7 +90,7 @@ def test_agent_attention_is_that_of_a_loop_over_cells() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
-def test_sizes_that_agree_are_merged_to_what_they_agree_on() -> None:
+def test_compatible_sizes_are_merged() -> None:
     module = made(MultiScaleWindowAttention, 8, (2, 3))
     assert isinstance(module, MultiScaleWindowAttention)
     module.branches[1] = module.branches[0]
@@ -132,7 +132,7 @@ def method_with_weights(seed: int = 1) -> V2XViT:
     return method
 
 
-def test_who_does_not_reach_the_ego_s_surroundings_changes_nothing() -> None:
+def test_agent_out_of_reach_changes_nothing() -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = method_with_weights()
     far = checks.sent(method, other, checks.FAR)

@@ -55,7 +55,7 @@ def centre_of(image: torch.Tensor, config: PointPillarsConfig, stride: int) -> n
     ],
     ids=str,
 )
-def test_a_hill_is_where_its_place_is_moved_to(config: PointPillarsConfig, stride: int, pose: SE2) -> None:
+def test_peak_is_warped_to_its_new_place(config: PointPillarsConfig, stride: int, pose: SE2) -> None:
     middle = np.array([sum(config.x_range) / 2, sum(config.y_range) / 2])
     pose = SE2(*middle) @ pose @ SE2(*middle).inverse()  # turn about the middle, lest the hill leaves the map
     ego_place = middle + [9.0, 5.0]

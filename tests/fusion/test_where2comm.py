@@ -88,7 +88,7 @@ def test_confident_cells_are_those_that_are_sent() -> None:
     np.testing.assert_array_equal(cells, np.flatnonzero(smooth.ravel() >= threshold))
 
 
-def test_in_training_a_random_share_of_the_most_confident_cells_is_selected() -> None:
+def test_training_selects_random_share_of_confident_cells() -> None:
     seen = checks.view(DETECTOR, 0)
     method = method_with(0.5).train()
     with torch.random.fork_rng(devices=[]), torch.no_grad():
@@ -116,7 +116,7 @@ def test_the_ego_is_never_masked() -> None:
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1.0])
-def test_who_sends_nothing_of_the_ego_s_surroundings_changes_nothing(threshold: float) -> None:
+def test_agent_sending_nothing_nearby_changes_nothing(threshold: float) -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = method_with(threshold)
     pose = checks.FAR if threshold == 0.0 else checks.POSES[0]
@@ -166,7 +166,7 @@ def test_distances_are_those_to_the_sensor() -> None:
     assert distance[8, 31].item() == pytest.approx(math.hypot(12.4, 0.4), abs=1e-5)
 
 
-def test_cells_that_the_map_does_not_have_are_refused() -> None:
+def test_cells_outside_the_map_are_refused() -> None:
     method = method_with(0.0)
     message = {"cells": np.array([ROWS * COLUMNS], np.uint16), "features": np.zeros((1, CHANNELS), np.float16)}
     with pytest.raises(ValueError, match="message"):

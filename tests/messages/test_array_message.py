@@ -45,7 +45,7 @@ def test_a_message_cut_short_is_refused(arrays: dict[str, np.ndarray], length: i
         decode_arrays(message[: min(length, len(message) - 1)])
 
 
-def test_the_size_is_the_numbers_and_a_few_bytes() -> None:
+def test_size_is_data_plus_small_header() -> None:
     message = encode_arrays({"map0": np.zeros((48, 100, 176), dtype=np.float16)})
     assert len(message) == 48 * 100 * 176 * 2 + (6 + 1 + 4 + 2 + 3 * 4 + 4)
 

@@ -137,7 +137,7 @@ def test_what_a_row_means(row: dict[str, Any], field: str, expected: Any, why: s
         ({"boxes": [{**ROW, "": 1}]}, "boxes: row 0: unknown key ''"),
     ],
 )
-def test_every_bad_document_is_one_line_naming_source_row_and_field(document: Any, expected: str) -> None:
+def test_bad_document_names_source_row_and_field(document: Any, expected: str) -> None:
     with pytest.raises(ValueError) as caught:
         from_dict(document, source="left.json")
     assert str(caught.value).startswith("left.json: ")
@@ -166,7 +166,7 @@ DEEP = "[" * 200_000
         (b'{"boxes": [], "boxes": []}', "the key 'boxes' comes twice"),
     ],
 )
-def test_every_bad_file_is_one_line_naming_the_file(tmp_path: Path, content: bytes, expected: str) -> None:
+def test_bad_file_is_named_in_one_line(tmp_path: Path, content: bytes, expected: str) -> None:
     path = tmp_path / "left.json"
     path.write_bytes(content)
     with pytest.raises(ValueError) as caught:
@@ -181,7 +181,7 @@ def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
     assert len(read_object_list(tmp_path / "a.json")) == 0
 
 
-def test_a_file_that_is_not_there_is_the_systems_own_error_which_names_it(tmp_path: Path) -> None:
+def test_missing_file_raises_the_system_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"missing\.json"):
         read_object_list(tmp_path / "missing.json")
 
@@ -196,7 +196,7 @@ documents = (
 
 
 @given(documents)
-def test_any_document_is_boxes_or_a_one_line_value_error(document: Any) -> None:
+def test_any_document_parses_or_raises_one_line(document: Any) -> None:
     message = ""
     try:
         from_dict(document)

@@ -74,7 +74,7 @@ def messages(draw: st.DrawFn) -> ObjectMessage:
     )
 
 
-def test_the_layout_is_the_documented_one_byte_for_byte() -> None:
+def test_layout_matches_documentation_byte_for_byte() -> None:
     data = encode(message(agent_id="é", boxes=boxes(1, center=[[1, 2, 3]], yaw=[0.5])))
     body = (
         b"CBVG"
@@ -148,7 +148,7 @@ def test_boxes_without_track_ids_come_back_without_them() -> None:
 
 
 @pytest.mark.parametrize("track_id", [0, 1, 2**24 - 1, 2**24])
-def test_every_track_id_up_to_two_to_the_24_is_exact(track_id: int) -> None:
+def test_track_ids_up_to_2_24_are_exact(track_id: int) -> None:
     got = decode(encode(message(boxes=boxes(1, track_id=[track_id])))).boxes
     assert got.track_id is not None
     assert got.track_id.tolist() == [track_id]
@@ -180,7 +180,7 @@ def test_yaw_is_sent_within_half_a_turn(yaw: float, expected: float, why: str) -
         (MAX_OBJECTS, "a" * MAX_AGENT_ID_BYTES, 131_176),
     ],
 )
-def test_the_size_is_header_plus_id_plus_32_bytes_an_object_plus_checksum(n: int, agent_id: str, size: int) -> None:
+def test_size_is_header_id_objects_checksum(n: int, agent_id: str, size: int) -> None:
     assert encoded_size(n, agent_id) == size
     assert len(encode(message(agent_id=agent_id, boxes=boxes(n)))) == size
 
@@ -204,7 +204,7 @@ def test_the_size_is_header_plus_id_plus_32_bytes_an_object_plus_checksum(n: int
         ({"boxes": boxes(MAX_OBJECTS + 1)}, "boxes: 4097 objects, a message holds at most 4096"),
     ],
 )
-def test_a_message_outside_of_the_limits_cannot_be_made(changes: dict[str, Any], expected: str) -> None:
+def test_message_outside_limits_raises(changes: dict[str, Any], expected: str) -> None:
     with pytest.raises(MessageError, match=expected):
         message(**changes)
 
@@ -229,7 +229,7 @@ def test_boxes_that_would_arrive_wrong_are_not_encoded(changes: dict[str, Any], 
 
 
 @pytest.mark.parametrize("n", [-1, MAX_OBJECTS + 1])
-def test_the_size_of_an_impossible_message_is_an_error(n: int) -> None:
+def test_size_of_impossible_message_raises(n: int) -> None:
     with pytest.raises(MessageError, match="n_objects"):
         encoded_size(n, "a")
 
@@ -265,7 +265,7 @@ def test_anything_behind_the_message_is_an_error(sent: ObjectMessage, tail: byte
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda tail: b"CBVG\x02" + tail))
-def test_any_bytes_are_a_message_or_a_message_error(data: bytes) -> None:
+def test_any_bytes_decode_or_raise_message_error(data: bytes) -> None:
     try:
         got = decode(data)
     except MessageError:
@@ -279,7 +279,7 @@ def test_any_bytes_are_a_message_or_a_message_error(data: bytes) -> None:
     st.lists(st.tuples(st.integers(0, 60), st.integers(0, 255)), max_size=4),
 )
 @settings(max_examples=300)
-def test_a_faulty_sender_with_a_right_checksum_is_a_valid_message_or_a_message_error(
+def test_checksummed_garbage_decodes_or_raises_message_error(
     good: int, rows: list[list[float]], changes: list[tuple[int, int]]
 ) -> None:
     data = bytearray(with_objects([[*GOOD_ROW[:7], float(i)] for i in range(good)] + rows))
@@ -310,9 +310,7 @@ def test_a_faulty_sender_with_a_right_checksum_is_a_valid_message_or_a_message_e
         (7, 3.0, "track_id: rows 0 and 1 have the same id 3"),
     ],
 )
-def test_invalid_boxes_behind_a_right_checksum_are_refused_by_field_and_row(
-    column: int, value: float, expected: str
-) -> None:
+def test_invalid_checksummed_boxes_are_named_by_row(column: int, value: float, expected: str) -> None:
     row = [*GOOD_ROW[:7], 4.0]
     row[column] = value
     with pytest.raises(MessageError, match=f"invalid boxes: {expected}"):
@@ -341,7 +339,7 @@ def test_a_signalling_nan_is_refused_like_any_other() -> None:
         (36, b"\n", "agent_id must be printable"),
     ],
 )
-def test_a_wrong_header_is_refused_even_with_a_right_checksum(offset: int, patch: bytes, expected: str) -> None:
+def test_wrong_header_is_refused_despite_checksum(offset: int, patch: bytes, expected: str) -> None:
     data = bytearray(encode(message()))
     data[offset : offset + len(patch)] = patch
     with pytest.raises(MessageError, match=expected):

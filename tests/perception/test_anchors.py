@@ -66,7 +66,7 @@ BOXES = st.tuples(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(BOXES, min_size=1, max_size=5), st.data())
-def test_a_box_told_relative_to_any_anchor_is_the_same_box(boxes: list[tuple[float, ...]], data: st.DataObject) -> None:
+def test_anchor_encoding_round_trips(boxes: list[tuple[float, ...]], data: st.DataObject) -> None:
     index = [data.draw(st.integers(0, len(GRID) - 1)) for _ in boxes]
     again = GRID.decode(*GRID.encode(np.array(boxes), index), index)
     assert np.allclose(again[:, :6], np.array(boxes)[:, :6], atol=1e-6)
@@ -112,13 +112,13 @@ def test_every_object_has_an_anchor(box: list[float], why: str) -> None:
     assert np.allclose(decoded[:, :6], np.array(box)[:6], atol=1e-5)
 
 
-def test_a_small_object_takes_the_anchor_at_its_centre() -> None:
+def test_small_object_takes_nearest_anchor() -> None:
     """Of a dozen that cover it alike."""
     targets = assign_targets(rows([0.5, 0.3, -1, 1.0, 0.6, 1.4, 0.0]), [False], GRID)
     assert targets.positive.tolist() == [index_of(0.4, 0.4)]
 
 
-def test_two_objects_in_one_place_get_an_anchor_each() -> None:
+def test_coincident_objects_get_one_anchor_each() -> None:
     small = [0.4, 0.4, -1, 1.0, 0.6, 1.4, 0.0]
     targets = assign_targets(rows(small, small), [False, False], GRID)
     assert len(targets.positive) == 2
@@ -135,9 +135,7 @@ def test_two_objects_in_one_place_get_an_anchor_each() -> None:
         (-math.pi / 2 + 0.1, 1, 1, 0.1),
     ],
 )
-def test_the_direction_says_whether_it_faces_along_the_anchor(
-    yaw: float, kind: int, direction: int, residual: float
-) -> None:
+def test_direction_target_is_relative_to_anchor(yaw: float, kind: int, direction: int, residual: float) -> None:
     targets = assign_targets(rows([*CAR[:6], yaw]), [False], GRID)
     row = targets.positive.tolist().index(index_of(0.4, 0.4, kind))
     assert targets.direction[row] == direction
@@ -151,7 +149,7 @@ def test_ignored_objects_are_neither_target_nor_background() -> None:
     assert set(asked.positive) | set(asked.ignored) < set(ignored.ignored)
 
 
-def test_an_ignored_object_takes_nothing_from_one_that_counts() -> None:
+def test_ignored_object_takes_no_anchor_from_others() -> None:
     alone = assign_targets(rows(CAR), [False], GRID)
     both = assign_targets(rows(CAR, CAR), [False, True], GRID)
     assert both.positive.tolist() == alone.positive.tolist()

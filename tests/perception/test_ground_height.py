@@ -37,7 +37,7 @@ def test_the_ground_comes_to_where_it_is_expected(height: float, wanted: float) 
     assert estimate_height_correction(cloud(height)) == pytest.approx(wanted, abs=0.02)
 
 
-def test_the_body_below_the_sensor_is_not_taken_for_the_ground() -> None:
+def test_own_vehicle_below_sensor_is_not_ground() -> None:
     roof = np.zeros((5000, 4), np.float32) + np.array([0.5, 0.0, -0.3, 0.0], np.float32)
     assert estimate_height_correction(cloud(1.9, more=roof)) == 0.0
 
@@ -61,7 +61,7 @@ def mast() -> Frame:
     return simulated_scenario("validation", 0, 5, ScenarioSettings(frames=1, agents=1, roadside_units=1))[0]
 
 
-def test_a_sensor_on_a_mast_sees_vehicles_where_they_are(mast: Frame) -> None:
+def test_mast_sensor_boxes_are_in_its_frame(mast: Frame) -> None:
     agent, detector = mast.agents["-1"], PointPillars.pretrained("compact")
     assert agent.points is not None
     points = agent.points

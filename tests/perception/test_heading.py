@@ -66,7 +66,7 @@ def test_points_are_seen_in_the_vehicles_axes(
     np.testing.assert_allclose(looks.vehicle.numpy(), [[*CAR, 0.8, 0.5]], rtol=1e-6)
 
 
-def test_of_many_points_some_are_taken_all_over_the_vehicle_and_all_are_counted() -> None:
+def test_points_are_subsampled_evenly_and_counted() -> None:
     along = np.linspace(3.1, 6.9, 1000)
     cloud = np.column_stack([np.full(1000, 10.0), along, np.full((1000, 2), -1.0)]).astype(np.float32)
     looks = heading_inputs(cloud, found(CAR))
@@ -75,7 +75,7 @@ def test_of_many_points_some_are_taken_all_over_the_vehicle_and_all_are_counted(
     assert len(np.unique(looks.points[0, :, 0].numpy())) == looks.points.shape[1]
 
 
-def test_the_nearest_others_are_seen_in_the_vehicles_axes() -> None:
+def test_neighbours_are_in_vehicle_axes() -> None:
     """To a car that faces along y: one 8 m ahead that faces as it does, one to its left that comes towards it."""
     ahead, left = (10.0, 13.0, -1.0, 4.0, 2.0, 1.6, math.pi / 2), (7.0, 5.0, -1.0, 4.0, 2.0, 1.6, -math.pi / 2)
     vehicles = found(CAR, ahead, left)
@@ -113,7 +113,7 @@ def _around(vehicles: list[tuple[float, ...]], seed: int, count: int) -> Float32
 
 
 @given(clouds_and_vehicles(), st.integers(0, 5))
-def test_a_box_the_other_way_round_gets_the_opposite_answer(case: tuple[Float32Array, Found], seed: int) -> None:
+def test_reversed_box_gets_negated_logit(case: tuple[Float32Array, Found], seed: int) -> None:
     """So the vehicle faces the same way after all, whatever the box said and whatever was learnt."""
     cloud, vehicles = case
     net = random_net(seed)
@@ -130,7 +130,7 @@ def test_a_box_the_other_way_round_gets_the_opposite_answer(case: tuple[Float32A
 
 
 @given(clouds_and_vehicles(), st.floats(-math.pi, math.pi))
-def test_it_does_not_matter_which_way_the_sensor_faces(case: tuple[Float32Array, Found], angle: float) -> None:
+def test_sensor_orientation_does_not_matter(case: tuple[Float32Array, Found], angle: float) -> None:
     """A mast has no lane of its own."""
     cloud, vehicles = case
     pose = SE2(0.0, 0.0, angle)
@@ -152,7 +152,7 @@ def _far_from_ties(vehicles: Found) -> bool:
 
 
 @given(clouds_and_vehicles())
-def test_boxes_are_turned_where_the_answer_is_no_and_nothing_else_changes(case: tuple[Float32Array, Found]) -> None:
+def test_boxes_with_negative_logit_are_reversed_only(case: tuple[Float32Array, Found]) -> None:
     cloud, vehicles = case
     net = random_net()
     with torch.inference_mode():
@@ -179,7 +179,7 @@ def test_nothing_found_is_nothing_to_look_at() -> None:
     assert refine_headings(nothing, cloud_of(OBJECTS), random_net()) is nothing
 
 
-def test_rows_behind_the_last_point_are_not_looked_at() -> None:
+def test_padding_rows_are_ignored() -> None:
     looks = heading_inputs(_around([CAR], 0, 20), found(CAR))
     rubbish = looks.points.clone()
     rubbish[0, int(looks.number[0]) :] = 99.0

@@ -55,7 +55,7 @@ def test_perfect_output_costs_nothing() -> None:
     assert terms.direction < 1e-3
 
 
-def test_targets_of_a_batch_are_found_in_their_cloud() -> None:
+def test_batch_targets_are_found_in_their_cloud() -> None:
     batch = targets((OBJECTS[:0], False), (OBJECTS, False))
     assert (batch.positive >= N).all()
     assert LOSS(perfect(batch, 2), batch).total < LOSS(perfect(targets((OBJECTS, False)), 2), batch).total
@@ -70,7 +70,7 @@ def test_frames_without_anything_to_find_are_finite(objects: np.ndarray) -> None
     assert terms.box == terms.direction == terms.uncertainty == 0
 
 
-def test_a_box_half_a_turn_round_costs_direction_only() -> None:
+def test_reversed_box_costs_direction_only() -> None:
     batch = targets((OBJECTS, False))
     output = perfect(batch, 1)
     right = LOSS(output, batch)
@@ -98,7 +98,7 @@ def test_a_false_alarm_costs() -> None:
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
-def test_the_best_variance_is_the_square_of_the_error(column: int) -> None:
+def test_best_variance_is_squared_error(column: int) -> None:
     """And learning it moves no box: the residuals' gradient is that of the box loss alone."""
     batch = targets((OBJECTS[:1], False))
     output = perfect(batch, 1)

@@ -36,7 +36,7 @@ def test_what_comes_out_belongs_together(trained: PointPillars) -> None:
     assert out.boxes.score.tolist() == [s for s in out.detections.score if s >= 0.25]
 
 
-def test_a_vehicle_faces_one_way_as_long_as_it_is_seen(trained: PointPillars) -> None:
+def test_tracked_heading_is_stable(trained: PointPillars) -> None:
     """The head is made to mix up front and back in one frame of four; all that is told stays as it was."""
 
     def mix_up() -> None:

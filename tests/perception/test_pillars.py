@@ -58,12 +58,12 @@ CLOUDS = st.integers(0, 30).flatmap(lambda n: arrays(np.float64, (n, 4), element
 
 @settings(max_examples=40, deadline=None)
 @given(CLOUDS)
-def test_the_image_is_what_a_loop_over_pillars_gives(cloud: np.ndarray) -> None:
+def test_image_equals_loop_over_pillars(cloud: np.ndarray) -> None:
     with torch.no_grad():
         assert torch.allclose(image_of(cloud)[0], naive(cloud, encoder()), atol=1e-4)
 
 
-def test_rows_are_y_and_columns_are_x_from_min_to_max() -> None:
+def test_rows_are_y_and_columns_are_x() -> None:
     image = image_of([[-3.1, 0.1, 0, 0]], [[3.1, 0.1, 0, 0]], [[-3.1, 3.1, 0, 0]])
     where = [tuple(image[b].abs().sum(dim=0).nonzero()[0].tolist()) for b in range(3)]
     assert where == [(0, 0), (0, 15), (7, 0)]
@@ -84,7 +84,7 @@ def test_rows_are_y_and_columns_are_x_from_min_to_max() -> None:
         [1e30, 1, 0, 0],
     ],
 )
-def test_points_out_of_range_or_not_finite_change_nothing(point: list[float]) -> None:
+def test_invalid_points_change_nothing(point: list[float]) -> None:
     good = [[0.5, 1, 0, 0.5], [0.6, 1.1, -1, 0.2]]
     assert torch.equal(image_of([*good, point]), image_of(good))
     assert not image_of([point]).any(), "alone they are an empty cloud"
@@ -96,7 +96,7 @@ def test_an_intensity_not_finite_counts_as_zero(intensity: float) -> None:
     assert image_of([[0.5, 1, 0, intensity]]).any(), "the point is there"
 
 
-def test_clouds_of_a_batch_do_not_mix_and_may_be_empty() -> None:
+def test_batched_clouds_are_independent_and_may_be_empty() -> None:
     a, b = np.random.default_rng(0).uniform(-1, 3, (2, 50, 4))
     image = image_of(a, np.zeros((0, 4)), b)
     assert torch.allclose(image[0], image_of(a)[0], atol=1e-6)

@@ -74,7 +74,7 @@ def test_bad_points_are_named(detector: PointPillars, points: Any, message: str)
         detector.detect(points)
 
 
-def test_rows_with_nan_and_the_order_of_points_do_not_matter(trained: PointPillars) -> None:
+def test_point_order_and_nan_rows_do_not_matter(trained: PointPillars) -> None:
     shuffled = np.random.default_rng(0).permutation(np.vstack([CLOUD, np.full((50, 4), np.nan)]))
     assert np.allclose(trained.detect(shuffled).bev, trained.detect(CLOUD).bev, atol=1e-3)
 
@@ -119,7 +119,7 @@ def test_detecting_leaves_the_mode_as_it_was(detector: PointPillars) -> None:
 @pytest.mark.parametrize(
     ("name", "grid", "head"), [("opv2v", (200, 704), (100, 352, 2)), ("compact", (200, 352), (100, 176, 4))]
 )
-def test_the_configurations_have_the_sizes_that_the_papers_use(name: str, grid: Any, head: Any) -> None:
+def test_configurations_have_the_paper_sizes(name: str, grid: Any, head: Any) -> None:
     config = CONFIGS[name]
     assert (config.rows, config.columns) == grid
     assert config.head_shape == head
@@ -268,7 +268,7 @@ def test_onnx_says_the_same(trained: PointPillars, tmp_path: Path) -> None:
             assert np.abs(values[name] - value.numpy()).max() < 1e-4, name
 
 
-def test_cobevglue_imports_without_torch_and_says_what_is_missing() -> None:
+def test_import_without_torch_names_missing_extra() -> None:
     code = (
         "import sys\nimport cobevglue, cobevglue.tracking\n"
         "assert 'torch' not in sys.modules\nsys.modules['torch'] = None\n"

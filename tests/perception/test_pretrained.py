@@ -36,7 +36,7 @@ def drive(culver_city: Path) -> Scenario:
     return Scenario(scenario.name, FRAMES, lambda index: scenario[index])
 
 
-def test_they_are_of_the_configuration_they_are_called_by(name: str, detector: PointPillars) -> None:
+def test_weights_match_their_configuration(name: str, detector: PointPillars) -> None:
     assert detector.config == CONFIGS[name]
     assert not detector.training
 
@@ -56,7 +56,7 @@ def test_another_name_is_an_error_with_the_nearest() -> None:
         PointPillars.pretrained("compakt")
 
 
-def test_they_find_vehicles_on_a_network_they_were_not_trained_on(detector: PointPillars) -> None:
+def test_weights_detect_on_unseen_network(detector: PointPillars) -> None:
     """Bounds are far below what benchmarks/perception.py measures: this is to see that nothing is broken."""
     source = SimulatedEpisodes("test", 0, EpisodeSettings(snapshots=1, agents=4))
     report = evaluate_detections(

@@ -43,7 +43,7 @@ def test_the_default_sensor_is_opv2vs() -> None:
     assert np.diff(azimuth[1:]) == pytest.approx(360.0 / 1016, abs=1e-3)
 
 
-def test_rings_on_flat_ground_have_the_radius_of_height_over_tangent() -> None:
+def test_ground_rings_have_height_over_tangent_radius() -> None:
     settings = PERFECT.model_copy(update={"beams": 3, "elevation": (-30.0, -10.0), "shots": 90, "height": 2.0})
     points = scan((RayScene(ground()),), at(5.0, -3.0, 2.0), settings, rng()).points
     assert len(points) == 3 * 90
@@ -60,7 +60,7 @@ def test_points_are_in_the_sensors_frame() -> None:
     assert points[:, 0] == pytest.approx(10.0, abs=1e-3)
 
 
-def test_nearer_things_hide_farther_ones_in_whichever_scene_they_are() -> None:
+def test_nearer_objects_occlude_across_scenes() -> None:
     near, far = box((10.0, 0.0, 0.0), (1.0, 4.0, 4.0)), box((20.0, 0.0, 0.0), (1.0, 4.0, 4.0))
     for scenes in ((near, far), (far, near)):
         first, second = (RayScene(mesh, np.full(len(mesh), owner)) for mesh, owner in zip(scenes, (1, 2), strict=True))
@@ -92,7 +92,7 @@ def test_glass_lets_its_share_of_rays_through(transmission: float) -> None:
     assert bool(behind_glass) == (transmission == 1.0)
 
 
-def test_range_noise_is_along_the_ray_and_as_large_as_set() -> None:
+def test_range_noise_is_along_ray_as_set() -> None:
     settings = PERFECT.model_copy(update={"range_noise": 0.05})
     scene = RayScene(ground())
     exact, noisy = (scan((scene,), at(0, 0, 2.0), s, rng()).points[:, :3] for s in (PERFECT, settings))
@@ -117,7 +117,7 @@ def _nothing_lost() -> dict[str, float]:
     return {"dropout": 0.0, "dropout_at_zero": 0.0}
 
 
-def test_surfaces_have_their_own_intensity_where_the_sensor_measures_it() -> None:
+def test_surface_intensity_applies_where_measured() -> None:
     settings = PERFECT.model_copy(update={"intensity": "surface", "attenuation": 0.0, "beams": 1, "elevation": (0, 0)})
     mesh = Mesh.concatenate([wall(10.0), wall(-10.0)])
     mesh = replace(mesh, reflectivity=np.array([0.8, 0.8, 0.2, 0.2], dtype=np.float32))

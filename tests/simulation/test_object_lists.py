@@ -25,7 +25,7 @@ def content(frame: ObjectListFrame) -> bytes:
     return b"".join(parts)
 
 
-def test_the_default_scene_is_eight_seconds_at_ten_hertz_of_two_agents() -> None:
+def test_default_scene_is_80_frames_of_two_agents() -> None:
     scene = Junction()
     frames = list(scene)
     assert len(scene) == len(frames) == 80
@@ -35,7 +35,7 @@ def test_the_default_scene_is_eight_seconds_at_ten_hertz_of_two_agents() -> None
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_default_scene_has_enough_to_see_and_enough_in_common(seed: int) -> None:
+def test_default_scene_has_enough_common_objects(seed: int) -> None:
     frames = list(Junction(seed))[::4]
     visible = [len(view.visible) for frame in frames for view in frame.agents.values()]
     common = [len(frame.matches("car1", "car2")) for frame in frames]
@@ -44,7 +44,7 @@ def test_the_default_scene_has_enough_to_see_and_enough_in_common(seed: int) -> 
     assert min(common) < np.median(common) < max(common), "some frames are harder than others"
 
 
-def test_the_same_seed_gives_the_same_bytes_in_whatever_order_frames_are_asked_for() -> None:
+def test_same_seed_gives_same_bytes_in_any_order() -> None:
     first, again = Junction(3), Junction(3)
     backwards = [content(again[i]) for i in (79, 40, 0)]
     assert [content(first[i]) for i in (79, 40, 0)] == backwards
@@ -58,7 +58,7 @@ def test_consecutive_frames_have_different_errors() -> None:
     assert a.object_id.tolist() != b.object_id.tolist() or not np.allclose(a.boxes.size, b.boxes.size)
 
 
-def test_without_errors_detections_are_the_true_objects_in_the_agents_own_frame() -> None:
+def test_perfect_detections_are_true_objects_in_frame() -> None:
     for frame in list(Junction(1, PERFECT))[::20]:
         for view in frame.agents.values():
             in_world = view.boxes.transform(view.world_SE2_agent)
@@ -71,7 +71,7 @@ def test_without_errors_detections_are_the_true_objects_in_the_agents_own_frame(
             assert in_world.label.tolist() == truth.label.tolist()
 
 
-def test_the_true_relative_pose_lays_the_matches_over_each_other() -> None:
+def test_true_pose_aligns_matched_objects() -> None:
     for frame in list(Junction(2, PERFECT))[::10]:
         ego, other = frame.agents["car1"].boxes, frame.agents["car2"].boxes
         matches = frame.matches("car1", "car2")
@@ -80,7 +80,7 @@ def test_the_true_relative_pose_lays_the_matches_over_each_other() -> None:
         np.testing.assert_allclose(moved.center[matches[:, 1]], ego.center[matches[:, 0]], atol=1e-9)
 
 
-def test_matches_are_pairs_of_true_objects_only_and_swap_with_the_agents() -> None:
+def test_matches_are_true_pairs_and_swap() -> None:
     frame = Junction(0, JunctionSettings(errors=DetectionErrors(false_per_frame=10.0)))[40]
     matches = frame.matches("car1", "car2")
     ids = frame.agents["car1"].object_id[matches[:, 0]]
@@ -122,14 +122,14 @@ def test_hidden_objects_are_not_seen() -> None:
     assert count[0] < 0.9 * count[1]
 
 
-def test_one_agent_and_one_vehicle_is_a_scene_too() -> None:
+def test_one_agent_and_one_vehicle_is_valid() -> None:
     frame = Junction(0, JunctionSettings(agents=1, vehicles=1, errors=DetectionErrors.none()))[0]
     assert len(frame.agents["car1"].boxes) == 0
     assert frame.agents["car1"].object_id.shape == (0,)
     assert isinstance(frame.objects, Boxes)
 
 
-def test_frames_can_be_counted_from_the_end_and_not_beyond() -> None:
+def test_negative_indices_work_within_range() -> None:
     scene = Junction(0, JunctionSettings(duration=1.0))
     assert scene[-1].index == 9
     for index in (10, -11):
@@ -149,7 +149,7 @@ def test_frames_can_be_counted_from_the_end_and_not_beyond() -> None:
         ({"vehicle": 3}, "vehicle"),
     ],
 )
-def test_a_setting_that_makes_no_sense_is_an_error_that_names_it(changes: dict[str, Any], field: str) -> None:
+def test_invalid_setting_is_named(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(ValidationError, match=field):
         JunctionSettings(**changes)
 

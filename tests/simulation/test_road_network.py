@@ -37,12 +37,12 @@ def test_no_network_is_in_two_splits() -> None:
 
 
 @pytest.mark.parametrize(("split", "at_least"), [("train", 4), ("validation", 1), ("test", 1)])
-def test_every_split_has_every_kind_but_the_test_split_the_latest(split: str, at_least: int) -> None:
+def test_splits_have_every_kind_except_latest_in_test(split: str, at_least: int) -> None:
     for kind in NETWORK_KINDS[:-1] if split == "test" else NETWORK_KINDS:
         assert sum(RoadNetwork.load(name).kind == kind for name in NETWORKS[split]) >= at_least
 
 
-def test_the_folder_has_these_networks_only_and_is_small() -> None:
+def test_folder_has_only_listed_small_networks() -> None:
     files = list(NETWORKS_FOLDER.glob("*.net.xml.gz"))
     assert {file.name for file in files} == {f"{name}.net.xml.gz" for name in ALL}
     assert sum(file.stat().st_size for file in files) < 1_000_000
@@ -66,7 +66,7 @@ def test_junctions_have_signals(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name.startswith(("crossing", "junction"))])
-def test_at_crossings_lanes_for_turning_left_face_each_other(name: str) -> None:
+def test_left_turn_lanes_face_each_other(name: str) -> None:
     """The middle is ahead of the leftmost lane or right of that; at a junction it is half a lane to its left."""
     roads = RoadNetwork.load(name)
     leftmost = {lane.edge: lane for lane in roads.lanes if lane.edge.startswith("in") and "." in lane.edge}
@@ -88,7 +88,7 @@ def test_in_towns_streets_cross_and_some_at_signals(name: str) -> None:
     assert "traffic_light" in crossings
 
 
-def test_an_unknown_network_is_an_error_that_names_the_nearest() -> None:
+def test_unknown_network_error_names_nearest() -> None:
     with pytest.raises(ValueError, match=r"'roundabout_train0'; did you mean 'roundabout_train_0'\?"):
         RoadNetwork.load("roundabout_train0")
 
@@ -128,7 +128,7 @@ def test_the_roadside_is_right_of_the_rightmost_lane() -> None:
     assert side.edge.tolist() == ["road"] * 4
 
 
-def test_the_roadside_of_a_stored_network_is_beside_its_roads() -> None:
+def test_stored_roadside_is_beside_roads() -> None:
     roads = RoadNetwork.load("residential_train_0")
     distance = roads.distance_to_road(roads.roadside(3.0, offset=1.0).xy)
     assert distance.max() < 1.05

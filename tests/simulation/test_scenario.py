@@ -55,9 +55,7 @@ def content(views: dict[str, LidarView]) -> list[bytes]:
     ]
 
 
-def test_the_seed_decides_every_frame_whatever_was_asked_for_before(
-    drive: SimulatedScenario, views: list[dict[str, LidarView]]
-) -> None:
+def test_seed_decides_frames_in_any_order(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
     again = pickle.loads(pickle.dumps(drive))  # as another process has it, with nothing computed
     assert "traffic" not in vars(again)
     assert content(again.views(2)) == content(views[2])
@@ -65,9 +63,7 @@ def test_the_seed_decides_every_frame_whatever_was_asked_for_before(
     assert content(views[1]) != content(views[2])
 
 
-def test_all_agents_are_there_in_all_frames_and_near_each_other(
-    drive: SimulatedScenario, views: list[dict[str, LidarView]]
-) -> None:
+def test_agents_are_present_and_near_each_other(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
     assert [list(seen) for seen in views] == [["car1", "car2", "-1"]] * 3
     places = [views[1][agent].world_SE3_lidar[:2, 3] for agent in ("car1", "car2")]
     assert 4.0 < np.hypot(*(places[0] - places[1])) < SETTINGS.max_distance
@@ -76,7 +72,7 @@ def test_all_agents_are_there_in_all_frames_and_near_each_other(
     assert unit == -1
 
 
-def test_objects_that_several_agents_see_are_at_one_place_of_the_world(views: list[dict[str, LidarView]]) -> None:
+def test_shared_objects_coincide_in_the_world(views: list[dict[str, LidarView]]) -> None:
     for seen in views:
         world = {agent: transform_boxes(view.boxes, view.world_SE3_lidar) for agent, view in seen.items()}
         for one, other in (("car1", "car2"), ("car1", "-1"), ("car2", "-1")):
@@ -127,9 +123,7 @@ def test_frames_are_those_of_any_data_set(drive: SimulatedScenario, views: list[
     assert truth.label is not None
 
 
-def test_a_roadside_unit_stands_off_the_road_and_sees_the_junction(
-    drive: SimulatedScenario, views: list[dict[str, LidarView]]
-) -> None:
+def test_roadside_unit_is_off_road_seeing_junction(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
     poses = [seen["-1"].world_SE3_lidar for seen in views]
     np.testing.assert_array_equal(poses[0], poses[2])  # it does not move
     place = poses[0][:3, 3]
@@ -148,7 +142,7 @@ def test_many_roadside_units_stand_apart() -> None:
     assert apart.min() > 12.0
 
 
-def test_scenarios_take_the_networks_of_their_split_in_turn() -> None:
+def test_scenarios_cycle_networks_of_their_split() -> None:
     drives = list(simulated_scenarios("test", 12, seed=3))
     networks = [drive.network for drive in drives]
     assert set(networks) == set(NETWORKS["test"])
@@ -213,7 +207,7 @@ def test_too_few_vehicles_are_said_so() -> None:
         _choose_agents(traffic([(1, 0.0, "suv", 3)]), ScenarioSettings(agents=2), np.random.default_rng(0))
 
 
-def test_an_agent_that_left_is_not_in_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_departed_agent_is_not_in_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = SimulatedScenario(NETWORK, 4, ScenarioSettings(frames=3, agents=2))
     monkeypatch.setitem(vars(drive), "traffic", tuple(traffic([(1, 0.0, "suv", 3), (2, 9.0, "suv", 2)])))
     assert [list(frame.agents) for frame in drive] == [["car1", "car2"], ["car1", "car2"], ["car1"]]

@@ -99,7 +99,7 @@ def test_boxes_stand_on_the_ground_below_the_lidar() -> None:
     np.testing.assert_allclose(objects.center[:, 2] - objects.size[:, 2] / 2, -LIDAR_HEIGHT)
 
 
-def test_a_junction_that_is_full_is_an_error_and_not_an_endless_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_junction_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cobevglue.simulation.scripted_traffic._TRIES", 20)
     with pytest.raises(ValueError, match="the junction has room for"):
         place_traffic(300, 2, 1.0, np.random.default_rng([0, 0, 0]))

@@ -40,7 +40,7 @@ def test_the_seed_decides_everything() -> None:
     assert run("junction_train_0", 8, [2.0]) != first
 
 
-def test_it_does_not_matter_in_how_many_steps_time_passes() -> None:
+def test_number_of_steps_does_not_matter() -> None:
     assert run("roundabout_train_0", 1, [0.1] * 20) == run("roundabout_train_0", 1, [0.3, 1.2, 0.5])
 
 
@@ -54,7 +54,7 @@ def test_every_network_has_traffic_on_its_roads(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ONE_OF_EACH_KIND)
-def test_vehicles_drive_where_they_look_and_not_into_each_other(name: str) -> None:
+def test_vehicles_drive_forward_without_collision(name: str) -> None:
     with Traffic(name, 2) as traffic:
         before = traffic.vehicles()
         assert len(before) > 0.8 * traffic.target, "the scene is full from its beginning"
@@ -85,7 +85,7 @@ def test_boxes_reach_from_the_front_bumper_backwards() -> None:
             assert now.y[row] == pytest.approx(y - now.length[row] / 2 * math.cos(angle))
 
 
-def test_gaps_in_a_queue_are_between_bumpers_whatever_the_lengths() -> None:
+def test_queue_gaps_are_between_bumpers() -> None:
     """Fronts in a queue are the leader's length and a gap apart; without the shift of positions gaps would be wrong."""
     gaps = []
     with Traffic("junction_train_2", 5) as traffic:
@@ -155,7 +155,7 @@ def test_a_forgotten_simulation_is_not_in_the_way() -> None:
         assert len(traffic.vehicles())
 
 
-def test_an_unknown_network_is_an_error_that_names_the_nearest() -> None:
+def test_unknown_network_error_names_nearest() -> None:
     with pytest.raises(ValueError, match="did you mean 'highway_test_1'"):
         Traffic("highway_tset_1")
 

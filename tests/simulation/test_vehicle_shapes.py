@@ -60,7 +60,7 @@ def test_bounds_are_the_box(kind: str, seed: int) -> None:
     ],
 )
 @pytest.mark.parametrize("seed", range(8))
-def test_bonnets_are_lower_than_roofs_so_that_front_and_rear_differ(kind: str, front: float, seed: int) -> None:
+def test_bonnets_are_lower_than_roofs(kind: str, front: float, seed: int) -> None:
     length, _, height = SIZES[kind]
     mesh = vehicle_mesh(kind, SIZES[kind], rng(seed))
     heights = heights_along(mesh, np.array([-0.15, -0.05, 0.05, 0.1, front], dtype=np.float32) * length)
@@ -70,7 +70,7 @@ def test_bonnets_are_lower_than_roofs_so_that_front_and_rear_differ(kind: str, f
 
 @pytest.mark.parametrize(("kind", "body"), [(kind, body) for kind, bodies in BODIES.items() for body in bodies])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_varied_body_keeps_the_order_of_its_parts(kind: str, body: Body, seed: int) -> None:
+def test_varied_body_keeps_part_order(kind: str, body: Body, seed: int) -> None:
     changed = varied(body, rng(seed))
     along, shoulder, roof, plan = np.array(changed.stations).T
     assert along[0] == 0.0
@@ -106,7 +106,7 @@ def test_mirrors_make_the_box_wider_than_the_body(kind: str) -> None:
     assert np.median(y) > 0.5 * width - 0.35
 
 
-def test_wheels_stand_on_the_ground_and_the_sill_does_not() -> None:
+def test_wheels_touch_ground_and_sill_does_not() -> None:
     mesh = vehicle_mesh("sedan", SIZES["sedan"], rng())
     corners = mesh.triangles.reshape(-1, 3)
     touching = corners[corners[:, 2] < 0.05]
@@ -120,7 +120,7 @@ def test_some_windows_are_clear_and_some_are_not() -> None:
     assert 0 < sum(clear) < 30
 
 
-def test_no_two_of_a_kind_are_alike_and_the_same_seed_gives_the_same() -> None:
+def test_shapes_vary_and_are_reproducible() -> None:
     meshes = [vehicle_mesh("sedan", SIZES["sedan"], rng(seed)) for seed in (1, 1, 2)]
     assert np.array_equal(meshes[0].triangles, meshes[1].triangles)
     assert not np.array_equal(meshes[0].triangles.shape, meshes[2].triangles.shape) or not np.allclose(
@@ -128,12 +128,12 @@ def test_no_two_of_a_kind_are_alike_and_the_same_seed_gives_the_same() -> None:
     )
 
 
-def test_an_unknown_kind_is_an_error_that_lists_the_known() -> None:
+def test_unknown_kind_error_lists_known_kinds() -> None:
     with pytest.raises(ValueError, match=r"'tank'.*sedan"):
         vehicle_mesh("tank", (5.0, 2.0, 2.0), rng())
 
 
-def test_rays_that_pass_over_a_bonnet_hit_the_windscreen() -> None:
+def test_rays_over_bonnet_hit_windscreen() -> None:
     """Seen from the front the body's first surface at window height is behind the one at bumper height."""
     mesh = vehicle_mesh("sedan", SIZES["sedan"], rng())
     origins = np.array([[10.0, 0.1, 0.4], [10.0, 0.1, 1.25]], dtype=np.float32)

@@ -59,7 +59,7 @@ def test_what_counts_as_hidden_can_be_chosen() -> None:
         max_size=8,
     )
 )
-def test_the_nearest_box_is_never_wholly_hidden_and_a_box_never_gets_more_visible_by_company(
+def test_company_never_makes_a_box_more_visible(
     rows: list[tuple[float, float, float, float, float]],
 ) -> None:
     fractions = visible_fraction(boxes(*rows))

@@ -65,7 +65,7 @@ def test_slope_is_the_derivative_of_height() -> None:
 
 
 @pytest.mark.parametrize("kind", NETWORK_KINDS)
-def test_parked_vehicles_are_beside_the_road_and_not_in_each_other(kind: str) -> None:
+def test_parked_vehicles_are_beside_road_without_overlap(kind: str) -> None:
     roads = RoadNetwork.load(f"{kind}_validation_0")
     parked = World(roads.name, seed=1).parked
     if len(parked):
@@ -111,7 +111,7 @@ def test_points_on_objects_lie_in_their_boxes(views: list[LidarView]) -> None:
             assert inside >= 0.97 * view.point_count[row]
 
 
-def test_agents_do_not_list_themselves_but_see_each_other(views: list[LidarView], agents: list[int]) -> None:
+def test_agents_see_each_other_but_not_themselves(views: list[LidarView], agents: list[int]) -> None:
     for view, own in zip(views, agents, strict=True):
         assert view.boxes.track_id is not None
         assert own not in view.boxes.track_id
@@ -132,7 +132,7 @@ def test_two_agents_agree_on_where_things_are(views: list[LidarView]) -> None:
     assert in_world[0] == pytest.approx(in_world[1], abs=1e-6)
 
 
-def test_a_sensor_stands_above_the_roof_behind_the_middle(now: WorldAtTime, agents: list[int]) -> None:
+def test_sensor_is_above_roof_behind_middle(now: WorldAtTime, agents: list[int]) -> None:
     pose = now.sensor_on_vehicle(agents[0], LIDAR, np.random.default_rng(0))
     assert now.moving.track_id is not None
     row = int(np.flatnonzero(now.moving.track_id == agents[0])[0])

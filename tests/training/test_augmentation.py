@@ -46,7 +46,7 @@ def test_nothing_is_changed_where_nothing_shall_be() -> None:
     np.testing.assert_array_equal(after.boxes.bev, SAMPLE.boxes.bev)
 
 
-def test_a_mirrored_car_on_the_left_that_turns_left_is_on_the_right_and_turns_right() -> None:
+def test_mirrored_left_turning_car_turns_right() -> None:
     after = changed(mirror=1.0)
     np.testing.assert_allclose(after.boxes.center, SAMPLE.boxes.center * [1, -1, 1])
     np.testing.assert_allclose(after.boxes.yaw, -SAMPLE.boxes.yaw)

@@ -50,7 +50,7 @@ def test_splits_are_named_as_in_the_data_set(changes: list[str], splits: tuple[s
     assert (data.split_name(validation=False), data.split_name(validation=True)) == splits
 
 
-def test_a_file_overrides_its_preset_and_changes_override_both(tmp_path: Path) -> None:
+def test_file_overrides_preset_and_changes_override_both(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("preset: tiny\nseed: 3\noptimisation: {epochs: 9, clip: 2}\n")
     config = load_config(str(file), ["optimisation.clip=1"])

@@ -101,7 +101,7 @@ def test_files_say_what_they_are(config: TrainDetectorConfig, tmp_path: Path) ->
     assert weights(tmp_path, "best").keys() == weights(tmp_path).keys()
 
 
-def test_the_log_of_a_resumed_run_has_each_epoch_once(config: TrainDetectorConfig, tmp_path: Path) -> None:
+def test_resumed_log_has_each_epoch_once(config: TrainDetectorConfig, tmp_path: Path) -> None:
     run(config, tmp_path, max_minutes=0.0)
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"group": "train", "step": 5, "epoch": 1}\n{"group": "tr')  # of the epoch that was lost
@@ -130,7 +130,7 @@ def test_resuming_with_other_settings_names_them(config: TrainDetectorConfig, tm
     run(config.model_copy(update={"report_every": 99.0}), tmp_path, resume=True)  # this may change
 
 
-def test_a_new_run_starts_from_the_weights_of_another(config: TrainDetectorConfig, tmp_path: Path) -> None:
+def test_new_run_starts_from_given_weights(config: TrainDetectorConfig, tmp_path: Path) -> None:
     run(config, tmp_path / "first")
     slow = changed(config, optimisation={"learning_rate": 1e-9, "epochs": 1, "weight_decay": 0.0})
     run(slow.model_copy(update={"init_from": tmp_path / "first" / "last.safetensors"}), tmp_path / "second")

@@ -88,7 +88,7 @@ def test_any_agent_can_be_the_ego(features: Path) -> None:
     assert turned.early_features is None  # that of the other ego would be wrong
 
 
-def test_features_that_were_interrupted_are_completed_and_nothing_is_made_twice(
+def test_interrupted_features_are_completed_without_repetition(
     detector_file: Path, features: Path, tmp_path: Path
 ) -> None:
     detector = PointPillars.load(detector_file)
@@ -130,7 +130,7 @@ def test_training_learns_and_leaves_the_encoder_alone(detector_file: Path, featu
         FCooper(detector).load(tmp_path / "last.safetensors")
 
 
-def test_a_resumed_run_ends_where_the_uninterrupted_one_does(
+def test_resumed_run_equals_uninterrupted_run(
     detector_file: Path, features: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = config(detector_file, features)

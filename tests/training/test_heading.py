@@ -84,7 +84,7 @@ def test_it_may_start_from_another_detectors_refiner(examples: Path, tmp_path: P
         assert torch.allclose(value, theirs[name], atol=1e-8)
 
 
-def test_a_resumed_run_ends_as_one_that_was_never_interrupted(examples: Path, tmp_path: Path) -> None:
+def test_resumed_run_equals_uninterrupted_run(examples: Path, tmp_path: Path) -> None:
     train_heading(config(examples), tmp_path / "whole", report=silent)
 
     def interrupt(line: str) -> None:
@@ -113,7 +113,7 @@ def test_examples_are_made_once_and_of_one_kind(examples: Path, tmp_path: Path) 
         train_heading(config(examples, episodes=3), tmp_path / "three", report=silent)
 
 
-def test_a_detector_that_finds_nothing_has_nothing_to_look_at(tmp_path: Path) -> None:
+def test_detector_without_detections_gives_no_examples(tmp_path: Path) -> None:
     blind = PointPillars.pretrained("compact")
     assert blind.head.logits.bias is not None
     with torch.no_grad():
@@ -139,7 +139,7 @@ def test_a_look_is_stored_to_the_millimetre() -> None:
     assert (exact.half().float() - exact).abs().max() < 5e-3
 
 
-def test_augmentation_thins_shakes_and_hides_and_keeps_what_it_should() -> None:
+def test_augmentation_drops_and_jitters_within_limits() -> None:
     """On 400 vehicles with 10 to 100 points each at (1, 2, 3), with two others around each."""
     k = 400
     number = torch.linspace(10, 100, k).long()

@@ -33,7 +33,7 @@ def test_the_rate_has_one_top() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_run_of_a_step_or_two_has_a_rate(steps: int) -> None:
+def test_short_runs_have_a_learning_rate(steps: int) -> None:
     assert all(0.0 < learning_rate(step, steps, CONFIG) <= 1.0 for step in range(steps))
 
 
@@ -45,7 +45,7 @@ def test_a_run_of_a_step_or_two_has_a_rate(steps: int) -> None:
         ("bfloat16", torch.bfloat16),
     ],
 )
-def test_products_on_a_cpu_have_the_precision_asked_for(
+def test_cpu_products_have_the_requested_precision(
     precision: Literal["auto", "float32", "bfloat16"], kind: torch.dtype
 ) -> None:
     with autocast(OptimisationConfig(precision=precision), torch.device("cpu")):

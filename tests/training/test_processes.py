@@ -65,7 +65,7 @@ def test_one_process_writes_for_both(folder: Path) -> None:
     assert PointPillars.load(folder / "last.safetensors").metadata["epoch"] == 2
 
 
-def test_a_run_is_not_resumed_with_another_number_of_processes(folder: Path) -> None:
+def test_resuming_with_other_process_count_raises(folder: Path) -> None:
     with pytest.raises(ValueError, match=r"number of processes \(2 before, now 1\)"):
         train_detector(CONFIG, folder, resume=True, source=BoxesOnAPlane(), validation_source=BoxesOnAPlane())
 

@@ -20,7 +20,7 @@ def progress(folder: Path, every: float, lines: list[str]) -> tuple[EpochProgres
     return EpochProgress(FOUR_STEPS, 1, log, lines.append, every=every, name="coalign"), log
 
 
-def test_an_epoch_has_full_batches_and_ends_with_the_mean_of_its_steps(tmp_path: Path) -> None:
+def test_epoch_has_full_batches_and_reports_mean(tmp_path: Path) -> None:
     lines: list[str] = []
     epoch, log = progress(tmp_path, 1e9, lines)
     assert list(epoch.steps) == [4, 5, 6, 7]  # of the second epoch
@@ -34,7 +34,7 @@ def test_an_epoch_has_full_batches_and_ends_with_the_mean_of_its_steps(tmp_path:
     assert (entry["group"], entry["step"], entry["epoch"], entry["total"]) == ("epoch", 8, 1, 3.0)
 
 
-def test_between_there_is_a_line_for_what_was_done_since_the_one_before(tmp_path: Path) -> None:
+def test_progress_lines_cover_the_last_interval(tmp_path: Path) -> None:
     epoch, log = progress(tmp_path, 0.0, [])
     with log:
         for loss in (1.0, 2.0, 3.0, 6.0):
@@ -49,12 +49,12 @@ def test_between_there_is_a_line_for_what_was_done_since_the_one_before(tmp_path
 
 
 @pytest.mark.parametrize("loss", [float("nan"), float("inf")])
-def test_a_loss_that_is_no_number_ends_the_training_and_says_what_to_change(tmp_path: Path, loss: float) -> None:
+def test_non_finite_loss_ends_training_with_advice(tmp_path: Path, loss: float) -> None:
     epoch, log = progress(tmp_path, 0.0, [])
     with log, pytest.raises(DivergedError, match=r"step 5; the state of epoch 1 is kept.*learning_rate"):
         epoch.add({"total": torch.tensor(loss)}, rate=1.0)
 
 
-def test_too_few_samples_for_a_batch_are_an_error() -> None:
+def test_too_few_samples_for_a_batch_raise() -> None:
     with pytest.raises(ValueError, match="9 samples are no full batch of 2 for each of 5 processes"):
         FOUR_STEPS.steps_per_epoch(processes=5)

@@ -39,7 +39,7 @@ class Numbered(Dataset):
         }
 
 
-def test_a_pass_has_every_frame_once_with_all_agents_that_have_a_cloud() -> None:
+def test_pass_covers_every_frame_and_agent_once() -> None:
     source = DatasetEpisodes(Numbered(), frames_per_episode=1)
     assert len(source) == 7
     episodes = [source.episode(i) for i in range(7)]

@@ -78,7 +78,7 @@ def test_no_sample_comes_twice(workers: int, processes: int) -> None:
     assert len(samples) == len(set(samples)) == 2 * 5 * 2 * processes
 
 
-def test_a_sample_is_used_as_often_as_asked_for_and_differently_each_time() -> None:
+def test_samples_are_reused_with_different_augmentation() -> None:
     """24 items are two uses of twelve samples, which is four episodes: no fifth is made."""
     items = [item for batch in read(0, 1, 0, per_epoch=12, uses=2) for item in batch]
     samples = [item[:2] for item in items]
@@ -92,7 +92,7 @@ def test_samples_of_several_episodes_are_shuffled_together() -> None:
     assert len({episode for episode, _ in order[:6]}) > 2  # not one episode after the other
 
 
-def test_a_source_without_samples_is_an_error_not_a_hang() -> None:
+def test_source_without_samples_raises() -> None:
     stream = EpisodeStream(Numbers(0), tell, epochs=range(1), batches_per_epoch=1, batch_size=1, seed=0, pool=2)
     with pytest.raises(ValueError, match="no samples in 100 episodes"):
         next(iter(stream))

@@ -39,7 +39,7 @@ def test_every_vehicle_and_every_ghost_is_drawn_once(drive: DemoResult, row: str
     assert f"{verdict.found.sum()} of {frame.counted.sum()} found, {verdict.ghost.sum()} ghost" in title
 
 
-def test_the_comparison_has_a_plot_for_each_row_it_is_asked_for(drive: DemoResult) -> None:
+def test_comparison_has_one_plot_per_row(drive: DemoResult) -> None:
     titles = [axes.get_title(loc="left").split(":")[0] for axes in draw_comparison(drive).axes]
     assert titles == ["Ego only", "Fused on noisy GPS", "Fused under attack", "CoBEVGlue"]
 
@@ -55,7 +55,7 @@ def test_a_lane_is_as_wide_as_it_is(drive: DemoResult) -> None:
     np.testing.assert_allclose(np.hypot(*across.T), lane.width)
 
 
-def test_of_a_cloud_one_point_is_left_in_every_small_square_and_none_on_the_ground() -> None:
+def test_cloud_is_thinned_and_ground_removed() -> None:
     points: Float32Array = np.array(
         [[0.1, 0.1, 0.0, 0.5], [0.2, 0.3, 1.0, 0.5], [0.5, 0.1, 0.0, 0.5], [5.0, 5.0, -1.9, 0.5]], dtype=np.float32
     )
@@ -84,7 +84,7 @@ def test_the_player_has_all_that_was_found(drive: DemoResult) -> None:
             assert set(shown["rows"][row]["others"]) == set(frame.used_poses(row))
 
 
-def test_the_players_clouds_are_points_of_the_clouds_in_centimetres(drive: DemoResult) -> None:
+def test_player_clouds_are_in_centimetres(drive: DemoResult) -> None:
     shown = data_of(player(drive))["frames"][0]["clouds"]
     for name, points in drive.frames[0].points.items():
         at = np.frombuffer(base64.b64decode(shown[name]), dtype="<i2").reshape(-1, 2) / 100.0

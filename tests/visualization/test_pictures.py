@@ -39,7 +39,7 @@ def texts(figure: Figure) -> set[str]:
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
-def test_each_box_is_its_footprint_with_a_line_to_its_front(n: int) -> None:
+def test_box_is_footprint_with_heading_line(n: int) -> None:
     (axes,) = add_axes(new_figure(4, 4), 1, 1)
     boxes = some_boxes(n)
     draw_boxes(axes, boxes, "black")
@@ -54,7 +54,7 @@ def test_each_box_is_its_footprint_with_a_line_to_its_front(n: int) -> None:
 
 
 @pytest.mark.parametrize(("n", "common", "edges"), [(0, 0, 0), (1, 1, 0), (6, 3, 15), (20, 10, 190)])
-def test_a_small_object_graph_has_an_edge_between_any_two_nodes(n: int, common: int, edges: int) -> None:
+def test_small_object_graph_is_complete(n: int, common: int, edges: int) -> None:
     (axes,) = add_axes(new_figure(4, 4), 1, 1)
     draw_object_graph(axes, some_boxes(n), "black", common=np.arange(common))
     all_edges, subgraph = (c for c in axes.collections[:2] if isinstance(c, LineCollection))
@@ -62,14 +62,14 @@ def test_a_small_object_graph_has_an_edge_between_any_two_nodes(n: int, common: 
     assert len(subgraph.get_paths()) == common * (common - 1) // 2
 
 
-def test_a_large_object_graph_is_drawn_with_the_nearest_edges_only() -> None:
+def test_large_object_graph_has_nearest_edges_only() -> None:
     (axes,) = add_axes(new_figure(4, 4), 1, 1)
     draw_object_graph(axes, some_boxes(60), "black")
     assert 60 * 4 / 2 <= len(axes.collections[0].get_paths()) <= 60 * 4
 
 
 @pytest.mark.parametrize("n", [2, 8, 40])
-def test_an_alignment_is_three_plots_with_the_same_numbers_at_matched_objects(n: int) -> None:
+def test_alignment_has_three_plots_with_matched_numbers(n: int) -> None:
     ego = some_boxes(n)
     other = ego.transform(EGO_SE2_OTHER.inverse())
     alignment = Alignment(EGO_SE2_OTHER, np.column_stack([np.arange(n), np.arange(n)]), np.eye(3))
@@ -86,7 +86,7 @@ def test_an_alignment_is_three_plots_with_the_same_numbers_at_matched_objects(n:
 
 
 @pytest.mark.parametrize(("m", "n"), [(0, 0), (0, 3), (4, 3)])
-def test_a_refusal_is_drawn_with_its_reason_and_without_moved_boxes(m: int, n: int) -> None:
+def test_refusal_shows_reason_without_moved_boxes(m: int, n: int) -> None:
     figure = draw_alignment(some_boxes(m), some_boxes(n, seed=1), Alignment.refused("too few objects in common"))
     render(figure)
     assert "too few objects in common" in texts(figure)

@@ -42,7 +42,7 @@ def test_text_is_text_and_not_markup(tmp_path: Path) -> None:
         ("    kept\nnot kept", "<p>kept not kept</p>"),
     ],
 )
-def test_an_empty_line_ends_a_paragraph_and_indented_ones_are_kept(text: str, html: str) -> None:
+def test_empty_line_ends_paragraph_and_indents_stay(text: str, html: str) -> None:
     assert paragraphs(text) == html
 
 

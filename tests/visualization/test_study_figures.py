@@ -57,7 +57,7 @@ def test_each_method_is_a_line_over_the_levels(figures: list[Figure]) -> None:
     assert [label.get_text() for label in axes.get_xticklabels()] == LEVELS
 
 
-def test_cobevglue_and_ego_only_are_set_apart_and_the_legend_goes_from_best_to_worst(figures: list[Figure]) -> None:
+def test_cobevglue_is_highlighted_and_legend_sorted(figures: list[Figure]) -> None:
     curves = {"No collaboration": [0.7] * 3, "late": [0.9, 0.6, 0.2], "lost": [math.nan] * 3, "CoBEVGlue": [0.8] * 3}
     study_figures.ap_over_noise(LEVELS, curves, "AP")
     lines = {str(line.get_label()): line for line in figures[0].axes[0].lines}
@@ -81,7 +81,7 @@ POINTS = [
 ]
 
 
-def test_points_with_one_label_are_a_line_and_labels_that_start_the_same_share_a_colour(figures: list[Figure]) -> None:
+def test_same_label_is_a_line_sharing_colour(figures: list[Figure]) -> None:
     assert is_picture(study_figures.ap_over_bytes(POINTS, "AP"))
     (axes,) = figures[0].axes
     lines = {str(line.get_label()): line for line in axes.lines}
@@ -110,7 +110,7 @@ def test_truth_and_detections_are_drawn_whatever_is_missing(
     assert {str(c.get_label()): len(c.get_paths()) for c in boxes} == {"truth": n, "detected": 2 * n}
 
 
-def test_the_matching_picture_has_the_others_boxes_where_the_pose_puts_them(figures: list[Figure]) -> None:
+def test_matching_picture_moves_other_boxes_by_pose(figures: list[Figure]) -> None:
     pose, ego = SE2(10.0, -5.0, 0.7), cars(0.0, 10.0, 30.0)
     matches = np.column_stack([np.arange(3), np.arange(3)])
     assert is_picture(

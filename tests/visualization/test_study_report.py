@@ -40,7 +40,7 @@ def test_the_row_of_cobevglue_is_set_off(tmp_path: Path) -> None:
     assert text.count('class="strong"') == 1
 
 
-def test_sections_come_in_order_after_a_list_of_them(tmp_path: Path) -> None:
+def test_sections_are_listed_and_ordered(tmp_path: Path) -> None:
     picture = ap_over_noise(["0 m"], {"late": [0.5]}, "title")
     first = Section("First", "one", figures=[("A figure", picture)])
     text = written(tmp_path / "index.html", first, Section("Second", "two"))
@@ -50,7 +50,7 @@ def test_sections_come_in_order_after_a_list_of_them(tmp_path: Path) -> None:
     assert "http" not in text
 
 
-def test_what_is_no_picture_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+def test_non_picture_is_refused_and_nothing_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="figure 'A figure': not a PNG"):
         write_report(tmp_path / "index.html", "A study", [Section("S", "", figures=[("A figure", b"")])])
     assert not list(tmp_path.iterdir())
