@@ -202,3 +202,20 @@ def test_cut_bin_files_are_named(tmp_path: Path, content: bytes, message: str) -
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(ValueError, match=rf"a\.bin: {message}"):
         read_bin(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"POINTS 3\n", b"", "the header has no POINTS$"),
+        (b"POINTS 3\n", b"POINTS three\n", "invalid literal .* 'three'"),
+        (b"DATA ascii", b"DATA text", "data: Input should be "),
+    ],
+)
+def test_a_broken_header_is_named_in_words(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    path = save(tmp_path / "a.pcd", Encoding.ASCII, "intensity", np.zeros(3, dtype=np.float32))
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    with pytest.raises(ValueError, match=rf"a\.pcd: not readable as PCD: {message}"):
+        read_pcd(path)

@@ -117,3 +117,15 @@ def test_binary_and_missing_files_raise(tmp_path: Path) -> None:
 def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     (tmp_path / "f.yaml").write_bytes(b"\xef\xbb\xbfa: 1\nb: 2\n")
     assert read_yaml(tmp_path / "f.yaml", ("a", "b")) == {"a": 1, "b": 2}
+
+
+def test_a_repeated_key_is_named(tmp_path: Path) -> None:
+    """PyYAML would keep the last one, and an object of a file that lists its id twice would be lost."""
+    (tmp_path / "f.yaml").write_text("a:\n  5: {x: 1}\n  6: {x: 2}\n  5: {x: 3}\n")
+    with pytest.raises(ValueError, match=r"f\.yaml: not readable as YAML: the key 5 is repeated .*line 4"):
+        read_yaml(tmp_path / "f.yaml", ("a",))
+
+
+def test_a_merged_mapping_may_override_keys(tmp_path: Path) -> None:
+    (tmp_path / "f.yaml").write_text("b: &b {x: 1, y: 2}\na:\n  <<: *b\n  x: 3\n")
+    assert read_yaml(tmp_path / "f.yaml", ("a",))["a"] == {"x": 3, "y": 2}

@@ -146,6 +146,7 @@ def _write(path: Path, fields: Sequence[str], columns: Sequence[Float32Array]) -
 
 def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
     """The points of a file as a structured array with a column for each field."""
+    from pydantic import ValidationError
     from pypcd4.pypcd4 import PointCloud
 
     if not path.is_file():
@@ -157,7 +158,12 @@ def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
         # (a table of one row loses its axis in numpy's text reader)
         data: np.ndarray[tuple[int], np.dtype[Any]] = np.atleast_1d(cloud.pc_data)
         promised = int(cloud.metadata.points)
-    except Exception as error:  # a parser of foreign bytes: pydantic, struct, lzf, numpy and lookup errors
+    except ValidationError as error:  # of the header
+        absent = [str(problem["loc"][0]).upper() for problem in error.errors() if problem["type"] == "missing"]
+        first = error.errors()[0]
+        why = f"the header has no {', '.join(absent)}" if absent else f"{first['loc'][0]}: {first['msg']}"
+        raise ValueError(f"{path}: not readable as PCD: {why}") from None
+    except Exception as error:  # a parser of foreign bytes: struct, lzf, numpy and lookup errors
         raise ValueError(f"{path}: not readable as PCD: {' '.join(str(error).split())[:200]}") from None
     if len(data) != promised:
         raise ValueError(f"{path}: the header promises {promised} points, the file has {len(data)}")

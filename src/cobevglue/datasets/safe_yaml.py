@@ -37,7 +37,7 @@ def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: the file is not there.
-        ValueError: it is not YAML, not a mapping, or has a tag that is not plain data; names the file.
+        ValueError: it is not YAML, not a mapping, repeats a key, or has a tag that is not plain data; names the file.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # a byte-order mark is no part of the first key
@@ -59,7 +59,17 @@ def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
 
 
 class _NumpySafeLoader(_SafeLoader):
-    """The safe loader plus tuples and numeric numpy arrays, scalars and types."""
+    """The safe loader plus tuples and numeric numpy arrays, scalars and types; a key that is repeated is an error."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        pairs = node.value
+        mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
+        # PyYAML keeps the last of equal keys: an object would be lost. (A merge, <<, makes a new list of pairs.)
+        if node.value is pairs and len(mapping) != len(pairs):
+            names = [key.value for key, _ in pairs]
+            key = next((key for row, (key, _) in enumerate(pairs) if key.value in names[:row]), pairs[-1][0])
+            raise yaml.constructor.ConstructorError(None, None, f"the key {key.value} is repeated", key.start_mark)
+        return mapping
 
 
 class _NdarrayName:
