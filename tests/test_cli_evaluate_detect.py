@@ -168,7 +168,7 @@ def test_real_clouds(culver_city: Path, weights: str, capsys: pytest.CaptureFixt
         (["--root", "{root}", "--weights", "compcat"], "compcat"),  # no such model
         (
             ["--root", "{labels}", "--weights", "{weights}"],
-            "no clouds, only the labels of 24 frames of agents; looked for",
+            "no clouds, only the labels of 24 frames of agents; looked for {labels}",
         ),  # labels only
         (["--weights", "{weights}"], "needs --root"),  # a data set that is nowhere
         (["--dataset", "simulated", "--root", "{root}", "--weights", "{weights}"], "neither --root"),  # made up anyway
@@ -192,7 +192,7 @@ def test_bad_input_is_one_line(
     assert evaluate(*words) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert said in captured.err
+    assert said.format(labels=labels) in captured.err
     assert len(captured.err.splitlines()) == 1
 
 

@@ -240,3 +240,20 @@ def test_boxes_are_kept_without_what_nobody_looks_at(settings: StudySettings) ->
     assert isinstance(boxes, Boxes)
     assert boxes.track_id is None
     assert boxes.label is None
+
+
+def test_frames_without_label_files_are_skipped_and_counted(settings: StudySettings) -> None:
+    from dataclasses import replace
+
+    from cobevglue.datasets import AgentFrame
+    from cobevglue.experiments.observed_sequence import ObservedSequence
+
+    def missing() -> tuple[np.ndarray, Boxes]:
+        raise FileNotFoundError("calibration.json is not there")
+
+    first, second, *_ = open_drive(settings, 0)
+    points = second.agents["2"].points
+    broken = replace(second, agents={**second.agents, "2": AgentFrame(missing, lambda: points)})
+    sequence = ObservedSequence(Models(settings).detector)
+    assert sequence.observe([first, broken]) == range(1)
+    assert sequence.left_out["frames without a label or calibration file"] == 1

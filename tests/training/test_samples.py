@@ -65,3 +65,17 @@ def test_an_episode_depends_on_seed_and_index_alone() -> None:
 def test_reader_options_are_refused_for_simulated_data() -> None:
     with pytest.raises(ValueError, match=r"data\.reader: has no effect on simulated data"):
         make_source(DataConfig(reader={"labels": "original"}), 0, validation=False)
+
+
+def test_clouds_without_labels_are_left_out_with_warning() -> None:
+    class Incomplete(Numbered):
+        def _agents(self, number: int) -> dict[str, AgentFrame]:
+            def missing() -> tuple[np.ndarray, Boxes]:
+                raise FileNotFoundError("labels.json is not there")
+
+            agents = super()._agents(number)
+            return {**agents, "b": AgentFrame(missing, lambda: np.zeros((1, 4), dtype=np.float32))}
+
+    with pytest.warns(UserWarning, match="a cloud without labels is left out: labels.json is not there"):
+        samples = DatasetEpisodes(Incomplete(), frames_per_episode=1).episode(0)
+    assert len(samples) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
+import os
 import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -108,7 +109,7 @@ def evaluate_detect(task: DetectTask, as_json: bool) -> None:
     if not counts.clouds:
         raise InputError(
             f"{task.root}: {task.data} has no clouds, only the labels of {counts.without_cloud} frames of agents; "
-            f"looked for {_cloud_location(task)}"
+            f"looked for {_cloud_location(task)}; {task.root} holds {', '.join(sorted(os.listdir(task.root))[:8])}"
         )
     if as_json:
         about = {"dataset": task.dataset, "split": task.split, "scenario": task.scenario, "weights": task.weights}

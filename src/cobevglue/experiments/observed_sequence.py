@@ -29,7 +29,8 @@ class ObservedSequence:
     """Observations of all agents over a sequence. `frames` and `truth` grow with each call of `observe`.
 
     The ego is the first vehicle, in the order of names, of the first frame in which a vehicle has a cloud. Agents
-    without a cloud are skipped, and frames without the ego are skipped; both are counted. Agents may come and go.
+    without a cloud, frames without the ego, and frames of which a label or calibration file is missing are skipped and
+    counted. Agents may come and go.
 
     Attributes:
         detector: of all agents.
@@ -75,13 +76,18 @@ class ObservedSequence:
             self.left_out["frames without the ego"] += 1
             return
         agents = {name: frame.agents[name] for name in clouds}
+        try:
+            poses = {name: agent.world_SE3_lidar for name, agent in agents.items()}
+            objects = frame.ground_truth(self.ego)
+        except FileNotFoundError:
+            self.left_out["frames without a label or calibration file"] += 1
+            return
         seen = {}
         for name, points in clouds.items():
             perception = self._perception.setdefault(name, Perception(self.detector))
             seen[name] = perception.step(points, frame.time)
-        poses = {name: agent.world_SE3_lidar for name, agent in agents.items()}
         self.frames.append(ObservedFrame(frame.time, seen, poses, poses))
-        self.truth.append(_truth(frame, self.ego, agents, seen))
+        self.truth.append(_truth(frame.timestamp, objects, self.ego, agents, seen))
 
     def _clouds(self, frame: Frame) -> Iterator[tuple[str, Float32Array]]:
         for name, agent in frame.agents.items():
@@ -93,9 +99,12 @@ class ObservedSequence:
 
 
 def _truth(
-    frame: Frame, ego: str, agents: Mapping[str, AgentFrame], seen: Mapping[str, PerceptionOutput]
+    timestamp: str,
+    objects: Boxes,
+    ego: str,
+    agents: Mapping[str, AgentFrame],
+    seen: Mapping[str, PerceptionOutput],
 ) -> FrameTruth:
-    objects = frame.ground_truth(ego)
     points = np.zeros(len(objects), np.int64)
     detected: dict[str, BoolArray] = {}
     for name, agent in agents.items():
@@ -108,7 +117,7 @@ def _truth(
     seconds = Counter[str]()
     for view in seen.values():
         seconds.update(view.seconds)
-    return FrameTruth(frame.timestamp, objects.replace(track_id=None), points, co_visible, dict(seconds))
+    return FrameTruth(timestamp, objects.replace(track_id=None), points, co_visible, dict(seconds))
 
 
 def _detected(objects: Boxes, boxes: Boxes) -> BoolArray:

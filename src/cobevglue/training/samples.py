@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -71,9 +72,15 @@ class DatasetEpisodes:
         return list(itertools.chain.from_iterable(self._samples(*self._frames[row]) for row in chosen))
 
     def _samples(self, scenario: str, number: int) -> list[LabelledCloud]:
-        agents = self._dataset[scenario][number].agents.values()
-        return [
-            LabelledCloud(agent.points, agent.objects, count_points(agent.points, agent.objects))
-            for agent in agents
-            if agent.points is not None
-        ]
+        samples = []
+        for agent in self._dataset[scenario][number].agents.values():
+            points = agent.points
+            if points is None:
+                continue
+            try:
+                objects = agent.objects
+            except FileNotFoundError as error:
+                warnings.warn(f"a cloud without labels is left out: {error}", stacklevel=2)
+                continue
+            samples.append(LabelledCloud(points, objects, count_points(points, objects)))
+        return samples
