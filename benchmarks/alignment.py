@@ -2,6 +2,7 @@
 
     python benchmarks/alignment.py                      # everything below, about 10 minutes
     python benchmarks/alignment.py --only v2v4real      # recorded detections of two real cars
+    python benchmarks/alignment.py --only bodies        # the same in the cars' own frames, own vehicles given or not
     python benchmarks/alignment.py --only opv2v         # OPV2V labels with detection errors added
     python benchmarks/alignment.py --only unrelated     # two agents that have nothing in common
     python benchmarks/alignment.py --only ablation      # each option of the default off, and the paper's own method
@@ -31,7 +32,13 @@ from cobevglue.alignment import Aligner
 from cobevglue.datasets import OPV2V
 from cobevglue.disturbance.detection_errors import DetectionErrors
 from cobevglue.evaluation.alignment import AlignmentSequence, Record, by_co_visible, evaluate, off_by_3, summarise
-from cobevglue.evaluation.alignment_data import V2V4REAL_TRAIN, V2V4REAL_VAL, noisy_label_sequences, v2v4real_sequences
+from cobevglue.evaluation.alignment_data import (
+    V2V4REAL_TRAIN,
+    V2V4REAL_VAL,
+    noisy_label_sequences,
+    v2v4real_car_sequences,
+    v2v4real_sequences,
+)
 
 SEEDS = (0, 1, 2)
 OFF = ("range_tolerance", "one_to_one", "heading_flips", "sizes", "refit", "temporal", "tracks", "verdict")
@@ -68,6 +75,19 @@ def v2v4real(data: Path) -> Table:
             table.append({"what": "val/0001 (nothing co-visible): accepted", "frames": accepted})
     everything = V2V4REAL_TRAIN + V2V4REAL_VAL + ("val/0000",)
     table += rows("all 16 sequences", run(real_cars(data, everything), BEVGlue))
+    show(table)
+    return table
+
+
+def bodies(data: Path) -> Table:
+    """Recorded detections in the cars' own frames, without and with the two cars themselves."""
+    print("## V2V4Real detections in the cars' own frames, frames in which the other car is labelled\n")
+    table: Table = []
+    for split, names in (("train", V2V4REAL_TRAIN), ("val", V2V4REAL_VAL)):
+        for given in (False, True):
+            cars = data / "v2v4real_cars.csv"
+            sequences = v2v4real_car_sequences(data / "v2v4real_detections", cars, names, bodies=given)
+            table += rows(f"{split}, {'with' if given else 'without'} own vehicles", run(sequences, BEVGlue))
     show(table)
     return table
 
@@ -167,7 +187,7 @@ def show(table: Table) -> None:
     print()
 
 
-TABLES = {"v2v4real": v2v4real, "opv2v": opv2v, "unrelated": unrelated, "ablation": ablation}
+TABLES = {"v2v4real": v2v4real, "bodies": bodies, "opv2v": opv2v, "unrelated": unrelated, "ablation": ablation}
 
 if __name__ == "__main__":
     main()

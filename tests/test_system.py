@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 
-from cobevglue import CoBEVGlue
+from cobevglue import BEVGlue, CoBEVGlue
 from cobevglue.alignment import ALIGNERS, Alignment, GroupAligner, Observation, group_aligner
-from cobevglue.boxes import covers_origin
+from cobevglue.alignment.group import Pairwise
+from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets import OPV2V
 from cobevglue.datasets.poses import inverse_SE3
 from cobevglue.fusion import FUSION_METHODS, FusionMethod, IntermediateFusion, fusion_class
@@ -256,3 +258,26 @@ def test_unknown_names_are_told_the_nearest() -> None:
     with pytest.raises(ValueError, match=r"'bevgleu'; did you mean 'bevglue'"):
         CoBEVGlue.pretrained("compact", fusion="none", aligner="bevgleu")
     assert set(ALIGNERS) >= {"bevglue", "given"}
+
+
+def test_own_vehicles_travel_with_the_boxes(compact: PointPillars) -> None:
+    """The other agent's vehicle costs 32 bytes; the aligner is given both, and none where none is known."""
+
+    class Listening(Pairwise):
+        bodies: ClassVar[list[tuple[float | None, ...]]] = []
+
+        def align_group(
+            self, ego: str, observations: Mapping[str, Observation], time: float | None = None
+        ) -> dict[str, Alignment]:
+            found = (observations["1"].body, observations["2"].body)
+            self.bodies.append(tuple(None if body is None else float(body.size[0, 0]) for body in found))
+            return super().align_group(ego, observations, time)
+
+    clouds = {"1": cloud(0), "2": cloud(1)}
+    vehicles = {name: Boxes([(0, 0, -1)], [(length, 2.0, 1.5)], [0.0]) for name, length in (("1", 4.5), ("2", 12.0))}
+    sent = []
+    for bodies in (None, vehicles):
+        system = CoBEVGlue(compact, method("late", compact), Listening(BEVGlue))
+        sent.append(system.step(clouds, "1", 0.0, bodies=bodies).alignment_bytes["2"])
+    assert Listening.bodies == [(None, None), (4.5, 12.0)]
+    assert sent[1] - sent[0] == 32

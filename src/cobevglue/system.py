@@ -93,6 +93,7 @@ class CoBEVGlue:
         ego: str,
         time: float | None = None,
         poses: Mapping[str, ArrayLike] | None = None,
+        bodies: Mapping[str, Boxes] | None = None,
     ) -> StepOutput:
         """The next frame.
 
@@ -102,6 +103,8 @@ class CoBEVGlue:
             time: of the clouds [s]; by default 0.1 s after the last.
             poses: (4, 4) world_SE3_lidar of every agent as its localisation claims, for aligners that need one; may be
                 left out with fusion "none", which needs none: all others are then refused.
+            bodies: one-row box of the own vehicle of each agent that knows it, in its LiDAR frame; transmitted with
+                the agent's boxes.
 
         Raises:
             ValueError: no such ego, a cloud or pose of a wrong shape, or `time` not later than the last; names the
@@ -112,7 +115,7 @@ class CoBEVGlue:
         start = perf_counter()
         seen = {agent: self.perceive(agent, cloud, time) for agent, cloud in points.items()}  # (1a)
         seconds = {"perception": perf_counter() - start}
-        return self.collaborate(seen, ego, time, poses, seconds)
+        return self.collaborate(seen, ego, time, poses, seconds, bodies)
 
     def perceive(self, agent: str, points: ArrayLike, time: float | None = None) -> PerceptionOutput:
         """Equation (1a): what one agent sees by itself. See `step` for the arguments."""
@@ -129,6 +132,7 @@ class CoBEVGlue:
         time: float | None = None,
         poses: Mapping[str, ArrayLike] | None = None,
         seconds: Mapping[str, float] | None = None,
+        bodies: Mapping[str, Boxes] | None = None,
     ) -> StepOutput:
         """Equations (1b) to (1e): from what each agent saw to what the ego knows. See `step` for the arguments."""
         if ego != self._ego:  # poses of the others are remembered in the ego's frame
@@ -143,7 +147,7 @@ class CoBEVGlue:
                 refused = Alignment.refused("no poses are given, and nothing is fused")
                 alignments = {agent: refused for agent in seen if agent != ego}
             else:
-                observations = self._observe(seen, ego, time, poses, sent)
+                observations = self._observe(seen, ego, time, poses, bodies or {}, sent)
                 alignments = self.aligner.align_group(ego, observations, time)  # (1b)
         alignment_bytes = {agent: sum(parts.values()) for agent, parts in sent.items()}
 
@@ -170,13 +174,14 @@ class CoBEVGlue:
         ego: str,
         time: float | None,
         poses: Mapping[str, ArrayLike] | None,
+        bodies: Mapping[str, Boxes],
         sent: dict[str, dict[str, int]],
     ) -> dict[str, Observation]:
         """What the aligner is given of every agent: of others, what arrived. Counts the bytes into `sent`."""
         observations = {}
         for agent, view in seen.items():
             pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
-            whole = Observation(view.boxes, view.variance, view.points, view.features, pose)
+            whole = Observation(view.boxes, bodies.get(agent), view.variance, view.points, view.features, pose)
             try:
                 needed = self.aligner.select_inputs(whole)
             except ValueError as error:

@@ -305,7 +305,7 @@ def test_checksummed_garbage_decodes_or_raises_message_error(
         (7, math.nan, "track_id: row 1 is nan"),
         (7, 1.5, "track_id: row 1 is 1.5"),
         (7, -1.0, "track_id: row 1 is -1.0"),
-        (7, -2.0, "track_id: row 1 is -2.0"),
+        (7, -3.0, "track_id: row 1 is -3.0"),
         (7, 2.0**25, "track_id: row 1 is 33554432.0"),
         (7, 3.0, "track_id: rows 0 and 1 have the same id 3"),
     ],
@@ -359,3 +359,36 @@ def test_any_kind_of_bytes_can_be_decoded(kind: Any) -> None:
 
 def test_a_message_error_is_a_value_error() -> None:
     assert issubclass(MessageError, ValueError)
+
+
+@pytest.mark.parametrize("ids", [True, False])
+@pytest.mark.parametrize("n", [0, 2])
+def test_own_vehicle_is_the_last_object(n: int, ids: bool) -> None:
+    objects = boxes(n) if ids else boxes(n, track_id=None)
+    body = Boxes([(0.5, 0.0, -0.75)], [(4.5, 2.0, 1.5)], [0.25])
+    data = encode(message(boxes=objects, body=body))
+    assert len(data) == encoded_size(n + 1, "car1")
+    assert struct.unpack("<8f", data[-36:-4]) == (0.5, 0.0, -0.75, 4.5, 2.0, 1.5, 0.25, -2.0)
+    decoded = decode(data)
+    assert decoded.body is not None
+    np.testing.assert_array_equal(decoded.body.bev, body.bev)
+    assert decoded.body.track_id is None
+    np.testing.assert_array_equal(decoded.boxes.bev, objects.bev)
+    assert decode(encode(message(boxes=objects))).body is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "error"),
+    [
+        ([[*GOOD_ROW[:7], -2.0], GOOD_ROW], "track_id: row 0 is -2.0"),  # only the last object may be the own vehicle
+        ([GOOD_ROW, [1.0, 2.0, 0.0, -4.5, 2.0, 1.5, 0.1, -2.0]], "size"),
+    ],
+)
+def test_invalid_own_vehicle_is_refused(rows: list[list[float]], error: str) -> None:
+    with pytest.raises(MessageError, match=error):
+        decode(with_objects(rows))
+
+
+def test_body_needs_one_row() -> None:
+    with pytest.raises(MessageError, match="body must be Boxes with one row"):
+        message(body=boxes(2))

@@ -11,6 +11,7 @@ from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.common_subgraph import common_subgraph, surviving_pairs
 from cobevglue.alignment.config import BEVGlueConfig
 from cobevglue.alignment.object_graph import ObjectGraph
+from cobevglue.alignment.own_body import append_body, check_bodies
 from cobevglue.alignment.procrustes import procrustes
 from cobevglue.boxes import Boxes
 from cobevglue.clock import Clock
@@ -43,22 +44,42 @@ class BEVGlue:
         )
         self._clock = Clock(_FRAME)
 
-    def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
+    def align(
+        self,
+        ego: Boxes,
+        other: Boxes,
+        time: float | None = None,
+        *,
+        ego_body: Boxes | None = None,
+        other_body: Boxes | None = None,
+    ) -> Alignment:
         """The relative pose in this frame, or a refusal with its reason.
+
+        An agent's own vehicle is an object to the other agent, which no detector of its own reports. Where it is given,
+        it takes part like any box, and a pose that places one vehicle into the other is refused.
 
         Args:
             ego: boxes in ego's frame, with track ids if there are any.
             other: the collaborator's boxes in its own frame.
             time: when both were seen [s], on any clock; 0.1 s after the last call by default.
+            ego_body: one-row box of the ego's own vehicle in the ego frame, if it is known.
+            other_body: one-row box of the collaborator's own vehicle in its own frame, as it transmits it.
+
+        Returns:
+            The pose with the matches of `ego` and `other`; matches of own vehicles are not listed.
 
         Raises:
-            ValueError: `time` is not finite, not in seconds or not later than the last call's.
+            ValueError: `time` is not finite, not in seconds or not later than the last call's, or a body has not one
+                row.
             TypeError: a list is no `Boxes`.
         """
         for name, boxes in (("ego", ego), ("other", other)):
             if not isinstance(boxes, Boxes):
                 raise TypeError(f"{name} must be Boxes, got {type(boxes).__name__}")
-        return self._matcher.align(ego, other, self._advance_clock(time))
+        with_bodies = append_body(ego, ego_body, "ego_body"), append_body(other, other_body, "other_body")
+        two_vehicles = ego_body is not None and other_body is not None
+        alignment = self._matcher.align(*with_bodies, self._advance_clock(time), last_differ=two_vehicles)
+        return check_bodies(alignment, ego, other, ego_body, other_body)
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -85,7 +106,7 @@ class _PaperMatcher:
     def reset(self) -> None:
         self._track_pairs: IntArray = np.zeros((0, 2), np.int64)
 
-    def align(self, ego: Boxes, other: Boxes, dt: float) -> Alignment:
+    def align(self, ego: Boxes, other: Boxes, dt: float, last_differ: bool) -> Alignment:
         ego_graph, other_graph = ObjectGraph.of(ego), ObjectGraph.of(other)
         carried = surviving_pairs(ego_graph, other_graph, self._track_pairs)
         pairs, confidence = common_subgraph(
@@ -138,7 +159,7 @@ class _EvidenceMatcher:
         self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
         self._seen = 0
 
-    def align(self, ego: Boxes, other: Boxes, dt: float) -> Alignment:
+    def align(self, ego: Boxes, other: Boxes, dt: float, last_differ: bool) -> Alignment:
         if not self._config.temporal:
             self.reset()
         self._hypotheses, margin, landing_std, pairs, x, y, yaw, covariance = self._kernels.advance(
@@ -147,6 +168,7 @@ class _EvidenceMatcher:
             _bev_rows(other),
             _NO_IDS if ego.track_id is None else ego.track_id,
             _NO_IDS if other.track_id is None else other.track_id,
+            last_differ,
             dt,
             self._seen,
             self._noise,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GroupAligner", "Need", "Observation", "Pairwise"]
 
-Need = Literal["boxes", "variance", "points", "features", "pose"]
+Need = Literal["boxes", "body", "variance", "points", "features", "pose"]
 """What an aligner may look at; fields of `Observation`."""
 
 
@@ -33,6 +33,7 @@ class Observation:
 
     Attributes:
         boxes: its tracked objects.
+        body: one-row box of its own vehicle.
         variance: (K, 3) of x, y [m^2] and yaw [rad^2] of the K boxes.
         points: (N, 4) x, y, z [m], intensity.
         features: the detector's three maps (C, H, W).
@@ -40,6 +41,7 @@ class Observation:
     """
 
     boxes: Boxes | None = None
+    body: Boxes | None = None
     variance: FloatArray | None = None
     points: Float32Array | None = None
     features: tuple[Tensor, Tensor, Tensor] | None = None
@@ -50,10 +52,12 @@ class GroupAligner(ABC):
     """A source of the poses of all other agents in the ego's frame. It may remember; one is needed for each ego.
 
     Attributes:
-        needs: the fields of an observation that it looks at.
+        needs: the fields of an observation that it uses.
+        accepts: further fields that it uses where they are given.
     """
 
     needs: ClassVar[frozenset[Need]]
+    accepts: ClassVar[frozenset[Need]] = frozenset()
 
     @abstractmethod
     def align_group(
@@ -79,7 +83,7 @@ class GroupAligner(ABC):
         missing = [name for name in sorted(self.needs) if getattr(observation, name) is None]
         if missing:
             raise ValueError(f"{type(self).__name__} needs {' and '.join(missing)} of every agent, got None")
-        return Observation(**{name: getattr(observation, name) for name in self.needs})
+        return Observation(**{name: getattr(observation, name) for name in self.needs | self.accepts})
 
     def encode(self, agent: str, observation: Observation, time: float, frame: int) -> dict[str, bytes]:
         """The messages by which an agent tells the others what this aligner needs of it, by kind.
@@ -88,9 +92,8 @@ class GroupAligner(ABC):
         """
         parts = {}
         if observation.boxes is not None:
-            parts["boxes"] = encode(
-                ObjectMessage(agent, time, frame, observation.boxes.replace(score=None, label=None))
-            )
+            boxes = observation.boxes.replace(score=None, label=None)
+            parts["boxes"] = encode(ObjectMessage(agent, time, frame, boxes, observation.body))
         for name, dtype in (("variance", np.float32), ("points", np.float32), ("pose", np.float64)):
             values = getattr(observation, name)
             if values is not None:
@@ -99,16 +102,18 @@ class GroupAligner(ABC):
 
     def decode(self, parts: Mapping[str, bytes], observation: Observation) -> Observation:
         """What the ego reads in the messages of another agent (`observation` has what does not travel by itself)."""
-        received = {name: decode_arrays(data)[name] for name, data in parts.items() if name != "boxes"}
+        received: dict[str, Any] = {name: decode_arrays(data)[name] for name, data in parts.items() if name != "boxes"}
         if "boxes" in parts:
-            received["boxes"] = decode(parts["boxes"]).boxes  # type: ignore[assignment]
-        return replace(observation, **received)  # type: ignore[arg-type]
+            message = decode(parts["boxes"])
+            received |= {"boxes": message.boxes, "body": message.body}
+        return replace(observation, **received)
 
 
 class Pairwise(GroupAligner):
     """One aligner of boxes for each collaborator, which it remembers."""
 
     needs = frozenset({"boxes"})
+    accepts = frozenset({"body"})
 
     def __init__(self, make_aligner: Callable[[], Aligner]) -> None:
         """Nothing is made before a collaborator is first met.
@@ -123,14 +128,15 @@ class Pairwise(GroupAligner):
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
     ) -> dict[str, Alignment]:
         """Each collaborator by itself."""
-        own = observations[ego].boxes
-        assert own is not None
+        own = observations[ego]
+        assert own.boxes is not None
         found = {}
         for name, other in observations.items():
             if name != ego:
                 assert other.boxes is not None
                 aligner = self._aligners.setdefault(name, self._make())
-                found[name] = aligner.align(own, other.boxes, time)
+                bodies = {"ego_body": own.body, "other_body": other.body}
+                found[name] = aligner.align(own.boxes, other.boxes, time, **bodies)
         return found
 
     def reset(self) -> None:

@@ -43,6 +43,8 @@ _SURPRISE = 2.0
 """Mean squared innovation, in standard deviations, above which a hypothesis' covariance is inflated."""
 _FEWEST_TO_OVERRULE = 4
 """Pairs that it takes for that."""
+_IMPOSSIBLE = 1e6
+"""Evidence against a pair that cannot be one object [nats]."""
 _STEP = 0.1
 """Memory is configured per frame of this length [s]."""
 
@@ -250,7 +252,7 @@ def _landing_std(h, other) -> float:
 
 
 @kernel(error_model="numpy")
-def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries, rounds):
+def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, motion, tries, rounds):
     """One frame: predict, follow, search, link, update.
 
     Args:
@@ -259,6 +261,7 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
         other: (N, 5) boxes.
         ego_ids: (M,) track ids, or (0,) when there are none.
         other_ids: (N,) likewise.
+        last_differ: whether the last boxes of both are known to be different objects, the agents' own vehicles.
         dt: seconds since the last frame.
         seen: frames seen before this one.
         noise: the noise model.
@@ -284,6 +287,8 @@ def advance(old, ego, other, ego_ids, other_ids, dt, seen, noise, motion, tries,
     jumped = np.zeros(len(stars), np.bool_)
     count = 0
     sizes = size_evidence(ego, other, noise)
+    if last_differ:
+        sizes[len(ego) - 1, len(other) - 1] = -_IMPOSSIBLE
     for i in range(before):
         _predict(old[i], dt, motion)
     if len(ego) > 0 and len(other) > 0:

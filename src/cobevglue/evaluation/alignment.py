@@ -50,6 +50,9 @@ class PairFrame:
         ego_SE2_other: the true relative pose.
         co_visible: how many objects both detected.
         pairs: (K, 2) rows of ego and other that are one object, or None where this is not known.
+        ego_body: one-row box of the ego's own vehicle in the ego frame, if it is given to the aligner.
+        other_body: likewise of the other agent, in its own frame.
+        time: of the frame [s]; None for 0.1 s after the last.
     """
 
     ego: Boxes
@@ -57,6 +60,9 @@ class PairFrame:
     ego_SE2_other: SE2
     co_visible: int
     pairs: IntArray | None = None
+    ego_body: Boxes | None = None
+    other_body: Boxes | None = None
+    time: float | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -121,7 +127,9 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
         aligner = make_aligner()
         for frame in sequence.frames:
             start = time.perf_counter()
-            alignment = aligner.align(frame.ego, frame.other)
+            alignment = aligner.align(
+                frame.ego, frame.other, frame.time, ego_body=frame.ego_body, other_body=frame.other_body
+            )
             seconds = time.perf_counter() - start
             translation = yaw = landing = math.inf
             if alignment.ego_SE2_other is not None:

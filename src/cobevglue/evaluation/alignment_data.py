@@ -6,6 +6,7 @@ other's boxes are moved into a frame that drives smoothly through the scene befo
 
 from __future__ import annotations
 
+import csv
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -33,6 +34,7 @@ __all__ = [
     "noisy_label_sequences",
     "perceived_sequences",
     "smooth_drive",
+    "v2v4real_car_sequences",
     "v2v4real_sequences",
 ]
 
@@ -99,6 +101,71 @@ def _v2v4real_sequence(root: Path, name: str, seed: int, min_score: float) -> Al
         moved = other.transform(ego_SE2_other.inverse())
         frames.append(PairFrame(ego_tracker.update(ego), other_tracker.update(moved), ego_SE2_other, len(both)))
     return AlignmentSequence(name, frames)
+
+
+def v2v4real_car_sequences(root: Path, cars: Path, names: tuple[str, ...], bodies: bool) -> list[AlignmentSequence]:
+    """Recorded detections of two real cars, each list in its own car's frame.
+
+    The other car's frame is its label's: origin at the box centre, x along the heading. Frames in which the other car
+    is not labelled are left out, since its pose is not known there; so are sequences in which it never is.
+
+    Args:
+        root: folder with `train` and `val`, as `shared/data/v2v4real_detections`.
+        cars: table of the labels that are the two cars, as `shared/data/v2v4real_cars.csv`.
+        names: such as "val/0004".
+        bodies: give each agent's own vehicle to the aligner. The ego's is the median of its labels.
+    """
+    with cars.open(newline="") as file:
+        ids = {
+            (f"{row['split']}/{int(row['sequence']):04d}", row["car"]): int(row["label_id"])
+            for row in csv.DictReader(file)
+        }
+    known = [name for name in names if (name, "other") in ids]
+    return [_v2v4real_car_sequence(root, name, ids[name, "other"], ids.get((name, "ego")), bodies) for name in known]
+
+
+def _v2v4real_car_sequence(root: Path, name: str, other_id: int, ego_id: int | None, bodies: bool) -> AlignmentSequence:
+    split, number = name.split("/")
+    files = [root / split / side / f"{number}.txt" for side in ("ego", "other", "labels")]
+    n = count_frames(*files)
+    ego_boxes, other_boxes = (read_v2v4real_detections(file, n) for file in files[:2])
+    labels = read_v2v4real_labels(files[2], n)
+    ego_body = _median_box([_with_id(label, ego_id) for label in labels]) if bodies else None
+    ego_tracker, other_tracker = Sort(), Sort()
+    frames = []
+    for i, (ego, other, label) in enumerate(zip(ego_boxes, other_boxes, labels, strict=True)):
+        car = _with_id(label, other_id)
+        if not len(car):
+            continue
+        ego_SE2_other = SE2(car.center[0, 0], car.center[0, 1], car.yaw[0])
+        moved = other.transform(ego_SE2_other.inverse())
+        frames.append(
+            PairFrame(
+                ego_tracker.update(ego, _FRAME * i),
+                other_tracker.update(moved, _FRAME * i),
+                ego_SE2_other,
+                len(set(_detected(label, ego)) & set(_detected(label, other))),
+                ego_body=ego_body,
+                other_body=car.transform(ego_SE2_other.inverse()).replace(track_id=None) if bodies else None,
+                time=_FRAME * i,
+            )
+        )
+    return AlignmentSequence(name, frames)
+
+
+def _with_id(labels: Boxes, track_id: int | None) -> Boxes:
+    """The row of this id, or none."""
+    if track_id is None or labels.track_id is None:
+        return labels[:0]
+    return labels[labels.track_id == track_id]
+
+
+def _median_box(boxes: Iterable[Boxes]) -> Boxes:
+    """The median box of one vehicle; a car at the origin where there is none."""
+    rows = Boxes.concatenate([part.replace(track_id=None) for part in boxes])
+    if not len(rows):
+        return Boxes([(0.0, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
+    return Boxes(np.median(rows.center, axis=0)[None], np.median(rows.size, axis=0)[None], [np.median(rows.yaw)])
 
 
 def _above(boxes: Boxes, min_score: float) -> Boxes:

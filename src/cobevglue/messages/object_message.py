@@ -21,8 +21,10 @@ Version 1 has no origin: the agent id is at offset 20, and x and y are in the se
   position, rounded to multiples of 1,024 m, and so 0 in the frame of a vehicle. A coordinate that arrives more than
   1 mm off all the same is an error.
 - Scores and labels are not sent: the paper sends eight numbers an object, and alignment needs no others.
+- The sender's own vehicle, if it transmits one, is the last object, with -2 in place of the track id.
 - Track ids are whole numbers from 0 to 2^24, which float32 holds exactly. Boxes without track ids carry -1 in every
-  row; -1 in only some rows is an error. A message without objects decodes to boxes without track ids.
+  row but that of the own vehicle; -1 in only some is an error. A message without objects decodes to boxes without
+  track ids.
 - A yaw outside [-pi, pi] is wrapped into it before it is rounded to float32, so that large angles lose nothing.
 - The CRC finds corruption (every single flipped bit among it), not forgery: a message is not authenticated.
 
@@ -74,7 +76,7 @@ _ORIGIN = struct.Struct("<2d")
 _ORIGIN_GRID = 1024.0  # origins are multiples of it [m]
 _TOLERANCE = 1e-3  # of a position after the round trip [m]
 _CHECKSUM = struct.Struct("<I")
-_NO_TRACK_ID = -1
+_NO_TRACK_ID, _OWN_VEHICLE = -1, -2
 _LARGEST_YAW = np.float32(np.pi)  # a little above pi: what the angles next to pi round to
 
 
@@ -91,6 +93,7 @@ class ObjectMessage:
         time: time stamp of the boxes [s], finite.
         frame: the sender's frame count, 0 to 2^32 - 1.
         boxes: the objects, in the sender's own LiDAR frame. Scores and labels stay behind when the message is encoded.
+        body: one-row box of the sender's own vehicle in the same frame, or None.
 
     Raises:
         MessageError: a field is outside of its limits; it names the field.
@@ -100,6 +103,7 @@ class ObjectMessage:
     time: float
     frame: int
     boxes: Boxes
+    body: Boxes | None = None
 
     def __post_init__(self) -> None:
         _agent_id_bytes(self.agent_id)
@@ -111,14 +115,18 @@ class ObjectMessage:
             raise MessageError(f"frame must be from 0 to {MAX_FRAME}, got {self.frame}")
         if not isinstance(self.boxes, Boxes):
             raise MessageError(f"boxes must be Boxes, got {type(self.boxes).__name__}")
-        if len(self.boxes) > MAX_OBJECTS:
-            raise MessageError(f"boxes: {len(self.boxes)} objects, a message holds at most {MAX_OBJECTS}")
+        if self.body is not None and (not isinstance(self.body, Boxes) or len(self.body) != 1):
+            raise MessageError(f"body must be Boxes with one row, got {self.body!r}")
+        if _count(self) > MAX_OBJECTS:
+            raise MessageError(f"boxes: {_count(self)} objects, a message holds at most {MAX_OBJECTS}")
         object.__setattr__(self, "time", float(self.time))
         object.__setattr__(self, "frame", int(self.frame))
 
 
 def encoded_size(n_objects: int, agent_id: str) -> int:
     """Bytes that a message of `agent_id` with `n_objects` takes: `len(encode(message))` without encoding.
+
+    The own vehicle counts as an object.
 
     Raises:
         MessageError: more objects or a longer agent id than a message holds.
@@ -138,19 +146,12 @@ def encode(message: ObjectMessage) -> bytes:
     """
     agent_id = _agent_id_bytes(message.agent_id)
     origin = _origin_of(message.boxes)
-    table = _table_of(message.boxes, origin)
-    try:
-        arrived = _boxes_of(table, origin)  # a size may round to zero, a coordinate to infinity: to be refused here
-    except ValueError as error:
-        raise MessageError(f"boxes do not fit float32: {error}") from None
-    error_m = np.abs(arrived.center - message.boxes.center).max(axis=1, initial=0.0)
-    if (error_m > _TOLERANCE).any():
-        row = int(error_m.argmax())
-        raise MessageError(
-            f"boxes do not fit float32: center: row {row} is {message.boxes.center[row].tolist()}, too far from the "
-            f"other objects around {origin.tolist()}: it would arrive {error_m[row]:.2g} m off"
-        )
-    header = _HEADER.pack(_MAGIC, VERSION, len(agent_id), len(message.boxes), message.frame, message.time)
+    table = _checked_table(message.boxes, origin, "boxes")
+    if message.body is not None:
+        row = _checked_table(message.body.replace(track_id=None), origin, "body")
+        row[0, 7] = _OWN_VEHICLE
+        table = np.concatenate([table, row])
+    header = _HEADER.pack(_MAGIC, VERSION, len(agent_id), _count(message), message.frame, message.time)
     body = header + _ORIGIN.pack(*origin) + agent_id + table.tobytes()
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
@@ -194,11 +195,18 @@ def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
     origin = np.array(_ORIGIN.unpack_from(data, _HEADER.size) if version > 1 else (0.0, 0.0))
     if not np.isfinite(origin).all():
         raise MessageError(f"origin must be finite, got {origin.tolist()}")
+    has_body = version > 1 and n_objects > 0 and table[-1, 7] == _OWN_VEHICLE
     try:
-        boxes = _boxes_of(table, origin)
+        boxes = _boxes_of(table[:-1] if has_body else table, origin)
+        body = _boxes_of(_without_track_id(table[-1:]), origin) if has_body else None
     except ValueError as error:
         raise MessageError(f"invalid boxes: {error}") from None
-    return ObjectMessage(agent_id=agent_id, time=time, frame=frame, boxes=boxes)
+    return ObjectMessage(agent_id=agent_id, time=time, frame=frame, boxes=boxes, body=body)
+
+
+def _count(message: ObjectMessage) -> int:
+    """Objects of a message, the own vehicle included."""
+    return len(message.boxes) + (message.body is not None)
 
 
 def _size(version: int, id_length: int, n_objects: int) -> int:
@@ -226,6 +234,30 @@ def _origin_of(boxes: Boxes) -> FloatArray:
     median = np.sort(boxes.center[:, :2], axis=0)[(len(boxes) - 1) // 2]
     origin: FloatArray = np.round(median / _ORIGIN_GRID) * _ORIGIN_GRID + 0.0  # no negative zeros
     return origin
+
+
+def _checked_table(boxes: Boxes, origin: FloatArray, name: str) -> Float32Array:
+    """The table of boxes that arrive as they are sent; MessageError where float32 does not hold them."""
+    table = _table_of(boxes, origin)
+    try:
+        arrived = _boxes_of(table, origin)  # a size may round to zero, a coordinate to infinity: to be refused here
+    except ValueError as error:
+        raise MessageError(f"{name} do not fit float32: {error}") from None
+    error_m = np.abs(arrived.center - boxes.center).max(axis=1, initial=0.0)
+    if (error_m > _TOLERANCE).any():
+        row = int(error_m.argmax())
+        raise MessageError(
+            f"{name} do not fit float32: center: row {row} is {boxes.center[row].tolist()}, too far from the "
+            f"other objects around {origin.tolist()}: it would arrive {error_m[row]:.2g} m off"
+        )
+    return table
+
+
+def _without_track_id(table: Float32Array) -> Float32Array:
+    """The same rows, with -1 in place of the track id."""
+    plain = table.copy()
+    plain[:, 7] = _NO_TRACK_ID
+    return plain
 
 
 def _table_of(boxes: Boxes, origin: FloatArray) -> Float32Array:
