@@ -19,10 +19,7 @@ import argparse
 import dataclasses
 import itertools
 import json
-import os
-import platform
 import sys
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -39,6 +36,7 @@ from cobevglue.evaluation.alignment_data import (
     v2v4real_car_sequences,
     v2v4real_sequences,
 )
+from common import DATA, print_head
 
 SEEDS = (0, 1, 2)
 OFF = ("range_tolerance", "one_to_one", "heading_flips", "sizes", "refit", "temporal", "tracks", "verdict")
@@ -52,12 +50,11 @@ def main() -> None:
     parser.add_argument("--only", choices=tuple(TABLES))
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    data = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
-    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seeds {SEEDS}\n")
+    print_head(f"seeds {SEEDS}")
     tables: dict[str, Table] = {}
     for name, table in TABLES.items():
         if arguments.only in (None, name):
-            tables[name] = table(data)
+            tables[name] = table(DATA)
             sys.stdout.flush()
     if arguments.json:
         arguments.json.write_text(json.dumps(tables, indent=1))

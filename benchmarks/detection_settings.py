@@ -8,9 +8,6 @@ The network runs once on each cloud; then each setting is changed on its own, be
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import time
 from typing import Any
 
 import torch
@@ -22,6 +19,7 @@ from cobevglue.perception import PointPillars
 from cobevglue.perception.config import DetectionConfig
 from cobevglue.perception.head import HeadOutput
 from cobevglue.simulation.episodes import SimulatedEpisodes
+from common import print_head
 
 RANGE = (-70.0, 70.0, -39.0, 39.0)
 MIN_POINTS = 5
@@ -53,7 +51,7 @@ def main() -> None:
     arguments = parser.parse_args()
     detector = PointPillars.named(arguments.weights)
     usual = detector.detection
-    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
+    print_head(f"weights {arguments.weights}")
     seen: list[tuple[Cloud, HeadOutput]] = []
     with torch.inference_mode():
         for cloud in simulated_clouds(SimulatedEpisodes("validation"), arguments.clouds):

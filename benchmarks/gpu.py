@@ -7,7 +7,6 @@ once; a step of training is forward, backward and optimiser. Boxes found on the 
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Callable
 
@@ -20,6 +19,7 @@ from cobevglue.simulation.episodes import SimulatedEpisodes
 from cobevglue.training.batches import Batches
 from cobevglue.training.config import PRESETS
 from cobevglue.training.optimisation import Learner, autocast
+from common import print_head
 
 REPEATS = 30
 
@@ -34,7 +34,7 @@ def main() -> None:
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    print(f"{time.strftime('%Y-%m-%d')}, {name}, {os.cpu_count()} cores, torch {torch.__version__}")
+    print_head(name, f"torch {torch.__version__}")
     clouds = [cloud.points for cloud in SimulatedEpisodes("validation").episode(0)][:16]
     for model in arguments.models:
         detector = PointPillars.named(model)

@@ -8,14 +8,9 @@ Both start from `Boxes` and return the whole (N, M) matrix.
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import re
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import shapely
@@ -23,6 +18,7 @@ import shapely
 from cobevglue import Boxes
 from cobevglue.iou import bev_iou, nms
 from cobevglue.typing import FloatArray, IntArray
+from common import print_head
 
 
 def traffic(n: int, rng: np.random.Generator) -> Boxes:
@@ -76,21 +72,12 @@ def milliseconds(function: Callable[[], object], seconds: float = 1.0) -> float:
     return 1e3 * float(np.median(times))
 
 
-def machine() -> str:
-    """The processor and Python that ran this."""
-    cpu = platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        cpu = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())[0]
-    return f"{cpu}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     seed = parser.parse_args().seed
-    print(f"$ python {' '.join(sys.argv)}\n")
-    print(f"{time.strftime('%Y-%m-%d')}, {machine()}, seed {seed}, shapely {shapely.__version__}\n")
+    print_head(f"seed {seed}", f"shapely {shapely.__version__}")
     print("| what | ours [ms] | shapely [ms] | ratio | largest difference | overlapping pairs |")
     print("|---|---|---|---|---|---|")
     for n in (40, 200, 1000):

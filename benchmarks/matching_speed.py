@@ -11,8 +11,6 @@ seeded: boxes spread like traffic, two thirds of them common, 0.3 m and 3 degree
 from __future__ import annotations
 
 import math
-import os
-import platform
 import time
 from collections.abc import Callable
 
@@ -20,6 +18,7 @@ import numpy as np
 
 from cobevglue import SE2, BEVGlue, BEVGlueConfig, Boxes
 from cobevglue.typing import FloatArray
+from common import print_head
 
 COUNTS = (5, 15, 40, 100, 200)
 STAR_SEARCH_UP_TO = 40
@@ -28,7 +27,7 @@ STAR_SEARCH_UP_TO = 40
 
 def main() -> None:
     """Print the table."""
-    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, seed 0")
+    print_head("seed 0")
     print("milliseconds, fastest | median\n")
     print("| boxes each | first | following | NumPy star search | ratio of the medians, first |\n|" + " --- |" * 5)
     for count in COUNTS:

@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import os
-import platform
 import resource
 import time
 from collections import Counter
@@ -38,6 +36,7 @@ from cobevglue.evaluation.detection_matching import DetectionFrame, find_failure
 from cobevglue.perception import Perception, PointPillars
 from cobevglue.simulation.episodes import SimulatedEpisodes
 from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenarios
+from common import DATA, print_head
 
 PARTS = ("real", "simulated", "headings", "alignment", "speed")
 SCENARIO = "TwoCars_1"
@@ -56,8 +55,8 @@ def main() -> None:
     parser.add_argument("--clouds", type=int, default=TEST_CLOUDS, help="simulated clouds")
     parser.add_argument("--split", default="test", help="of the simulated world")
     arguments = parser.parse_args()
-    data = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parent.parent.parent / "shared" / "data")) / "opv2v"
-    print(f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, weights {arguments.weights}\n")
+    data = DATA / "opv2v"
+    print_head(f"weights {arguments.weights}")
     detector = PointPillars.named(arguments.weights)
     wanted = (arguments.only,) if arguments.only else PARTS
     if "real" in wanted:

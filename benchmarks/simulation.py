@@ -9,19 +9,16 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import platform
-import re
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
 from cobevglue.simulation import lidar, world
 from cobevglue.simulation.scenario import ScenarioSettings, simulated_scenario
+from common import print_head
 
 Taken = dict[str, float]
 """Seconds of processor time by stage, of "all", and the number of "clouds"."""
@@ -80,14 +77,6 @@ def total(parts: list[Taken]) -> Taken:
     return {key: sum(part[key] for part in parts) for key in ("all", "clouds", *STAGES)}
 
 
-def machine() -> str:
-    """The processor and Python that ran this."""
-    cpu = platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        cpu = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())[0]
-    return f"{cpu}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, Python {platform.python_version()}"
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -108,8 +97,7 @@ def main() -> None:
     seconds = time.perf_counter() - began
     for worker in workers:
         worker.join()
-    print(f"$ python {' '.join(sys.argv)}\n")
-    print(f"{time.strftime('%Y-%m-%d')}, {machine()}\n")
+    print_head(f"load {os.getloadavg()[0]:.1f}")
     print(
         f"{given.drives} drives of {given.frames} frames, {AGENTS} agents, {given.processes} processes: "
         f"{taken['clouds']:.0f} clouds in {seconds:.1f} s = {taken['clouds'] / seconds:.1f} clouds/s\n"

@@ -22,14 +22,10 @@ still there, 2 m or more away: what the object matching can least bear.
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import re
 import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -49,8 +45,8 @@ from cobevglue.disturbance.detection_errors import DetectionErrors, add_detectio
 from cobevglue.iou import bev_iou
 from cobevglue.tracking import Sort, SortConfig
 from cobevglue.typing import BoolArray, FloatArray, IntArray
+from common import DATA, print_head
 
-DATA = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 KITTI_TUNED, KITTI_CONFIRMED = ("0001", "0006"), ("0008", "0010", "0012")
 V2V4REAL = {"train": [f"{k:04d}" for k in range(1, 11)], "val": ["0000", "0001", "0004", "0005", "0008"]}
 SAME_OBJECT = 2.0
@@ -314,14 +310,6 @@ def speed_table(seed: int) -> None:
         print(f"| {name} | {cells} | {1e3 / np.median(columns[50]):,.0f} |", flush=True)
 
 
-def machine() -> str:
-    """The processor and Python that ran this."""
-    cpu = platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        cpu = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())[0]
-    return f"{cpu}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -331,7 +319,7 @@ def main() -> None:
     parts = [arguments.only] if arguments.only else ["speed", "kitti", "v2v4real", "opv2v"]
     if parts != ["speed"] and not DATA.is_dir():
         sys.exit(f"no data in {DATA}: set COBEVGLUE_DATA, or run with --only speed")
-    print(f"$ python {' '.join(sys.argv)}\n\n{time.strftime('%Y-%m-%d')}, {machine()}, seed {arguments.seed}")
+    print_head(f"seed {arguments.seed}")
     if "speed" in parts:
         speed_table(arguments.seed)
     if "kitti" in parts:

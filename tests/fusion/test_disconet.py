@@ -62,15 +62,6 @@ def test_gradients_are_finite_outside_coverage() -> None:
     assert not maps.grad[1, :, :2].any()
 
 
-def test_agent_without_coverage_changes_nothing() -> None:
-    method = make_method()
-    ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
-    heard = [checks.sent(method, near, checks.POSES[0])]
-    checks.assert_same_boxes(
-        method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
-    )
-
-
 def test_distillation_loss_is_zero_for_equal_maps() -> None:
     torch.manual_seed(0)
     student, teacher = torch.randn(2, 8, 4, 5), torch.randn(2, 8, 4, 5)

@@ -53,6 +53,16 @@ def test_collaborators_matter(name: str) -> None:
     assert len(alone) != len(together) or np.abs(alone.bev - together.bev)[:n].max() > 1e-3
 
 
+@pytest.mark.parametrize("name", [n for n in LEARNED if n not in {"coalign", "fpv-rcnn"}])
+def test_agent_without_coverage_changes_nothing(name: str) -> None:
+    """But for CoAlign, whose attention counts empty cells, and FPV-RCNN, which takes over boxes from everywhere."""
+    method = made(name)
+    ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
+    heard = [checks.sent(method, near, checks.POSES[0])]
+    unreached = checks.sent(method, far, checks.FAR)
+    checks.assert_same_boxes(method.fuse(ego, [*heard, unreached]), method.fuse(ego, heard), atol=1e-5)
+
+
 @every_method
 def test_gradients_reach_every_weight(name: str) -> None:
     """Of a batch with a frame in which there is nobody but the ego."""

@@ -63,14 +63,5 @@ def test_gru_update_lies_between_state_and_candidate() -> None:
     assert torch.equal(update(state, heard), state)
 
 
-def test_agent_without_coverage_changes_nothing() -> None:
-    method = make_method()
-    ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
-    heard = [checks.sent(method, near, checks.POSES[0])]
-    checks.assert_same_boxes(
-        method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
-    )
-
-
 def test_it_goes_by_the_name_that_users_type() -> None:
     assert FUSION_METHODS["v2vnet"] is V2VNet

@@ -143,15 +143,6 @@ def test_message_weights_interpolate_to_v2vnet() -> None:
     checks.assert_same_boxes(loud.fuse(ego, heard), plain.fuse(ego, heard), atol=1e-6)
 
 
-def test_agent_without_coverage_changes_nothing() -> None:
-    method = make_method()
-    ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
-    heard = [checks.sent(method, near, checks.POSES[0])]
-    checks.assert_same_boxes(
-        method.fuse(ego, [*heard, checks.sent(method, far, checks.FAR)]), method.fuse(ego, heard), atol=1e-6
-    )
-
-
 def test_agents_alone_have_no_pose_to_learn() -> None:
     method = make_method()
     alone = checks.sample_of([checks.view(DETECTOR, 0)])

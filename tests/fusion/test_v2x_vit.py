@@ -126,19 +126,6 @@ def test_asking_for_the_ego_alone_gives_the_same() -> None:
     torch.testing.assert_close(block(x, present, 1), block(x, present, 3)[:1])
 
 
-def method_with_weights(seed: int = 1) -> V2XViT:
-    method = checks.seeded(V2XViT, DETECTOR, seed)
-    method.up.weight.data.mul_(500.0)  # at first they are close to 0
-    return method
-
-
-def test_agent_out_of_reach_changes_nothing() -> None:
-    ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
-    method = method_with_weights()
-    far = checks.sent(method, other, checks.FAR)
-    checks.assert_same_boxes(method.fuse(ego, [far]), method.fuse(ego, []), atol=1e-5)
-
-
 def test_channels_that_heads_cannot_share_are_refused() -> None:
     with pytest.raises(ValueError, match="channels: 6"):
         AgentAttention(6, heads=4)

@@ -72,21 +72,21 @@ def test_bonnets_are_lower_than_roofs(kind: str, front: float, seed: int) -> Non
 @pytest.mark.parametrize("seed", range(5))
 def test_varied_body_keeps_part_order(kind: str, body: Body, seed: int) -> None:
     changed = varied(body, rng(seed))
-    along, shoulder, roof, plan = np.array(changed.stations).T
+    along, shoulder, roof, plan = changed.profile
     assert along[0] == 0.0
     assert along[-1] == pytest.approx(1.0)
     assert (np.diff(along) > 0.0).all()
     assert 0.0 < changed.axles[0] < changed.axles[-1] < 1.0
     for share in (shoulder, roof, plan):
         assert ((share > 0.0) & (share <= 1.0)).all()
-    assert not np.allclose(along, np.array(body.stations)[:, 0])
+    assert not np.allclose(along, body.along)
 
 
 def test_every_body_has_windows() -> None:
     """Mirrors stand beside the foremost, and seats are seen through them."""
     for bodies in BODIES.values():
         for body in bodies:
-            _, shoulder, roof, _ = np.array(body.stations).T
+            _, shoulder, roof, _ = body.profile
             assert (roof - shoulder).max() > 0.2
 
 

@@ -246,10 +246,7 @@ def _calibration(path: Path) -> FloatArray:
     matrix = np.eye(4)
     matrix[:3, :3] = _array(path, content, "rotation", (3, 3))
     matrix[:3, 3] = _array(path, content, "translation", (3,))
-    try:
-        return rigid_SE3(matrix)
-    except ValueError as error:
-        raise ValueError(f"{path}: the transform {error}") from None
+    return rigid_SE3(matrix, f"{path}: the transform")
 
 
 def _array(path: Path, content: Mapping[str, Any], field: str, shape: tuple[int, ...]) -> FloatArray:

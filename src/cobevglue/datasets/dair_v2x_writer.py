@@ -94,7 +94,7 @@ def write_dair_v2x_frame(
     if not (frame.isascii() and frame.isdigit()):
         raise ValueError(f"frame must be digits, like '015438', got {frame!r}")
     sides = {_CAR: vehicle, _UNIT: infrastructure}
-    poses = {side: _checked_pose(side, sides[side].world_SE3_lidar) for side in sides}
+    poses = {side: rigid_SE3(sides[side].world_SE3_lidar, f"{side}: world_SE3_lidar") for side in sides}
     for side, had in sides.items():
         if had.points is not None:
             write_pcd_intensity(root / side / "velodyne" / f"{frame}.pcd", had.points)
@@ -179,13 +179,6 @@ def _list(path: Path) -> list[Any]:
     if not isinstance(content, list):
         raise ValueError(f"{path}: must be a list")
     return content
-
-
-def _checked_pose(side: str, matrix: ArrayLike) -> FloatArray:
-    try:
-        return rigid_SE3(matrix)
-    except ValueError as error:
-        raise ValueError(f"{side}: world_SE3_lidar {error}") from None
 
 
 def _calibration(matrix: FloatArray) -> dict[str, Any]:

@@ -76,10 +76,10 @@ def _lidar_pose(path: Path, lidar_pose: ArrayLike) -> FloatArray:
     """Six numbers, or a 4x4 matrix as some redistributions of the data have it."""
     try:
         values = np.asarray(lidar_pose, dtype=np.float64)
-        if values.shape == (4, 4):
-            return rigid_SE3(mirrored(values))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: lidar_pose {error}") from None
+    if values.shape == (4, 4):
+        return rigid_SE3(mirrored(values), f"{path}: lidar_pose")
     if values.shape != (6,) or not np.isfinite(values).all():
         raise ValueError(f"{path}: lidar_pose must be six finite numbers (x, y, z, roll, yaw, pitch), got {lidar_pose}")
     return SE3_from_carla(values)

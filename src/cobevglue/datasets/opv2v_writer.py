@@ -13,6 +13,7 @@ from cobevglue.boxes import Boxes
 from cobevglue.datasets.pcd import write_pcd_rgb
 from cobevglue.datasets.poses import carla_from_SE3, rigid_SE3
 from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.yaml_tree import check_timestamp
 from cobevglue.typing import ArrayLike
 
 __all__ = ["write_opv2v_frame"]
@@ -55,12 +56,11 @@ def write_opv2v_frame(
     Raises:
         ValueError: a pose is not rigid, the timestamp is not a number, objects have no ids, or points are malformed.
     """
-    if not (timestamp.isascii() and timestamp.isdigit()):
-        raise ValueError(f"timestamp must be digits, like '000068', got {timestamp!r}")
+    check_timestamp(timestamp)
     if objects.track_id is None:
         raise ValueError("objects must have a track_id")
-    lidar = _checked_pose("world_SE3_lidar", world_SE3_lidar)
-    vehicle = lidar if world_SE3_vehicle is None else _checked_pose("world_SE3_vehicle", world_SE3_vehicle)
+    lidar = rigid_SE3(world_SE3_lidar, "world_SE3_lidar")
+    vehicle = lidar if world_SE3_vehicle is None else rigid_SE3(world_SE3_vehicle, "world_SE3_vehicle")
     poses = carla_from_SE3(lidar @ _lidar_SE3_object(objects))
     offset = np.zeros((len(objects), 3))
     offset[:, 2] = objects.size[:, 2] / 2  # OPV2V's location is on the ground, its `center` lifts it to the box centre
@@ -89,13 +89,6 @@ def write_opv2v_frame(
         write_pcd_rgb(folder / f"{timestamp}.pcd", points)
     with whole_file(folder / f"{timestamp}.yaml") as path, path.open("w", encoding="utf-8") as file:
         yaml.dump(document, file, Dumper=_SafeDumper)
-
-
-def _checked_pose(name: str, matrix: ArrayLike) -> ArrayLike:
-    try:
-        return rigid_SE3(matrix)
-    except ValueError as error:
-        raise ValueError(f"{name} {error}") from None
 
 
 def _lidar_SE3_object(objects: Boxes) -> ArrayLike:

@@ -63,8 +63,12 @@ def mirrored(matrix: ArrayLike) -> FloatArray:
     return result
 
 
-def rigid_SE3(matrix: ArrayLike) -> FloatArray:
+def rigid_SE3(matrix: ArrayLike, name: str = "the matrix") -> FloatArray:
     """The proper rigid transform next to a stored (4, 4) matrix: its rotation is made exactly orthonormal.
+
+    Args:
+        matrix: the stored matrix.
+        name: what error messages call it.
 
     Raises:
         ValueError: another shape, a value that is not finite, or a matrix further than rounding from a rigid transform.
@@ -72,14 +76,18 @@ def rigid_SE3(matrix: ArrayLike) -> FloatArray:
     try:
         m = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError("must be a 4x4 matrix of numbers") from None
-    if m.shape != (4, 4) or not np.isfinite(m).all():
-        raise ValueError(f"must be a finite 4x4 matrix, got shape {m.shape}" if m.shape != (4, 4) else "is not finite")
+        raise ValueError(f"{name} must be a 4x4 matrix of numbers") from None
+    if m.shape != (4, 4):
+        raise ValueError(f"{name} must be a finite 4x4 matrix, got shape {m.shape}")
+    if not np.isfinite(m).all():
+        raise ValueError(f"{name} is not finite")
     left, scale, right = np.linalg.svd(m[:3, :3])
     if np.abs(scale - 1.0).max() > 1e-2 or np.abs(m[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise ValueError("is not a rigid transform (its rotation is not orthonormal or its last row is not 0 0 0 1)")
+        raise ValueError(
+            f"{name} is not a rigid transform (its rotation is not orthonormal or its last row is not 0 0 0 1)"
+        )
     if np.linalg.det(m[:3, :3]) < 0:
-        raise ValueError("is not a proper rotation (its determinant is -1)")
+        raise ValueError(f"{name} is not a proper rotation (its determinant is -1)")
     m[:3, :3] = left @ right
     m[3] = [0.0, 0.0, 0.0, 1.0]
     return m

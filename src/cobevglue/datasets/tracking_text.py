@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,10 +27,14 @@ __all__ = [
 _DETECTED_KINDS = {1: "pedestrian", 2: "car", 3: "cyclist"}
 
 
-class _Row(NamedTuple):
+class _Box(NamedTuple):
     center: tuple[float, float, float]
     size: tuple[float, float, float]
     yaw: float
+
+
+class _Row(NamedTuple):
+    box: _Box
     score: float | None
     track_id: int | None
     label: str
@@ -59,12 +64,7 @@ def read_v2v4real_detections(
         FileNotFoundError: the file is not there.
         ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
     """
-
-    def parse(words: list[str]) -> _Row:
-        kind, *_, score, height, width, length, x, z, y, yaw, _ = _floats(words[1:])
-        return _on_the_ground((x, y, z), (length, width, height), yaw, score, None, _detected_kind(kind), left_handed)
-
-    return _read(path, 15, parse, frame_count)
+    return _read_detections(path, partial(_v2v4real_box, left_handed), frame_count)
 
 
 def read_v2v4real_labels(
@@ -86,14 +86,7 @@ def read_v2v4real_labels(
         FileNotFoundError: the file is not there.
         ValueError: a line is broken or repeats an id in its frame; names the file and the line.
     """
-
-    def parse(words: list[str]) -> _Row:
-        height, width, length, x, z, y, yaw = _floats(words[10:])
-        return _on_the_ground(
-            (x, y, z), (length, width, height), yaw, None, _track_id(words[1]), words[2].lower(), left_handed
-        )
-
-    return _read(path, 17, parse, frame_count)
+    return _read_labels(path, partial(_v2v4real_box, left_handed), frame_count)
 
 
 def read_kitti_detections(path: str | Path, frame_count: int | None = None) -> list[Boxes]:
@@ -113,12 +106,7 @@ def read_kitti_detections(path: str | Path, frame_count: int | None = None) -> l
         FileNotFoundError: the file is not there.
         ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
     """
-
-    def parse(words: list[str]) -> _Row:
-        kind, *_, score, height, width, length, x, y, z, rotation_y, _ = _floats(words[1:])
-        return _from_camera((x, y, z), (length, width, height), rotation_y, score, None, _detected_kind(kind))
-
-    return _read(path, 15, parse, frame_count)
+    return _read_detections(path, _kitti_box, frame_count)
 
 
 def read_kitti_labels(
@@ -140,46 +128,47 @@ def read_kitti_labels(
         FileNotFoundError: the file is not there.
         ValueError: a line is broken or repeats an id in its frame; names the file and the line.
     """
-    kept = {name.lower() for name in classes}
-
-    def parse(words: list[str]) -> _Row | None:
-        if words[2].lower() not in kept:
-            return None
-        height, width, length, x, y, z, rotation_y = _floats(words[10:])
-        size = (length, width, height)
-        return _from_camera((x, y, z), size, rotation_y, None, _track_id(words[1]), words[2].lower())
-
-    return _read(path, 17, parse, frame_count)
+    return _read_labels(path, _kitti_box, frame_count, {name.lower() for name in classes})
 
 
-def _on_the_ground(
-    xyz: tuple[float, float, float],
-    size: tuple[float, float, float],
-    yaw: float,
-    score: float | None,
-    track_id: int | None,
-    label: str,
-    left_handed: bool,
-) -> _Row:
+def _v2v4real_box(
+    left_handed: bool, height: float, width: float, length: float, x: float, z: float, y: float, yaw: float
+) -> _Box:
     side = -1.0 if left_handed else 1.0
-    return _Row((xyz[0], side * xyz[1], xyz[2]), size, side * yaw, score, track_id, label)
+    return _Box((x, side * y, z), (length, width, height), side * yaw)
 
 
-def _from_camera(
-    xyz: tuple[float, float, float],
-    size: tuple[float, float, float],
-    rotation_y: float,
-    score: float | None,
-    track_id: int | None,
-    label: str,
-) -> _Row:
+def _kitti_box(height: float, width: float, length: float, x: float, y: float, z: float, rotation_y: float) -> _Box:
     """Camera axes are x right, y down, z forward; the location is the middle of the box's bottom.
 
     At rotation_y = 0 the box heads to camera x; a positive one turns it towards the camera, from x to -z. So the
     heading is (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
     """
-    x, y, z = xyz
-    return _Row((z, -x, -y + size[2] / 2), size, -rotation_y - math.pi / 2, score, track_id, label)
+    return _Box((z, -x, -y + height / 2), (length, width, height), -rotation_y - math.pi / 2)
+
+
+def _read_detections(path: str | Path, box: Callable[..., _Box], frame_count: int | None) -> list[Boxes]:
+    """`box` makes a box of the seven numbers from the height on."""
+
+    def parse(words: list[str]) -> _Row:
+        kind, _, _, _, _, score, *numbers, _ = _floats(words[1:])
+        return _Row(box(*numbers), score, None, _detected_kind(kind))
+
+    return _read(path, 15, parse, frame_count)
+
+
+def _read_labels(
+    path: str | Path, box: Callable[..., _Box], frame_count: int | None, classes: Collection[str] | None = None
+) -> list[Boxes]:
+    """`box` makes a box of the seven numbers from the height on; `classes` in lower case, None for all."""
+
+    def parse(words: list[str]) -> _Row | None:
+        label = words[2].lower()
+        if classes is not None and label not in classes:
+            return None
+        return _Row(box(*_floats(words[10:])), None, _track_id(words[1]), label)
+
+    return _read(path, 17, parse, frame_count)
 
 
 def _detected_kind(code: float) -> str:
@@ -213,8 +202,9 @@ def _read(
             row = parse(words)
             if row is None:
                 continue
-            if min(row.size[:2]) <= 0 or row.size[2] < 0:
-                raise ValueError(f"length and width must be > 0 and height >= 0, got {row.size}")
+            length, width, height = row.box.size
+            if min(length, width) <= 0 or height < 0:
+                raise ValueError(f"length and width must be > 0 and height >= 0, got {row.box.size}")
             if row.track_id is not None:
                 first = first_line.setdefault((frame, row.track_id), number)
                 if first != number:
@@ -229,9 +219,9 @@ def _boxes(rows: list[_Row]) -> Boxes:
     if not rows:
         return Boxes.empty()
     return Boxes(
-        center=[row.center for row in rows],
-        size=[row.size for row in rows],
-        yaw=[row.yaw for row in rows],
+        center=[row.box.center for row in rows],
+        size=[row.box.size for row in rows],
+        yaw=[row.box.yaw for row in rows],
         score=None if rows[0].score is None else [row.score for row in rows],
         track_id=None if rows[0].track_id is None else [row.track_id for row in rows],
         label=[row.label for row in rows],

@@ -81,10 +81,7 @@ def read_v2v4real_labels_yaml(path: Path, agent: str, left_handed: bool = LEFT_H
         ValueError: it is broken; names the file, the object and the field.
     """
     lidar_pose, table = read_objects(path, skip_kinds=("pedestrian",))
-    try:
-        world_SE3_lidar = rigid_SE3(lidar_pose)
-    except ValueError as error:
-        raise ValueError(f"{path}: lidar_pose {error}") from None
+    world_SE3_lidar = rigid_SE3(lidar_pose, f"{path}: lidar_pose")
     center, yaw = table.pose[:, :3], np.deg2rad(table.pose[:, 4])
     if left_handed:
         world_SE3_lidar, center, yaw = mirrored(world_SE3_lidar), center * [1.0, -1.0, 1.0], -yaw

@@ -14,6 +14,7 @@ from cobevglue.datasets.pcd import write_pcd_rgb
 from cobevglue.datasets.poses import mirrored, rigid_SE3
 from cobevglue.datasets.v2v4real import LEFT_HANDED
 from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.yaml_tree import check_timestamp
 from cobevglue.typing import ArrayLike
 
 __all__ = ["write_v2v4real_frame"]
@@ -60,14 +61,10 @@ def write_v2v4real_frame(
     folder = Path(agent_folder)
     if folder.name not in AGENTS:
         raise ValueError(f"agents of V2V4Real are called 0 and 1, got {folder.name!r}")
-    if not (timestamp.isascii() and timestamp.isdigit()):
-        raise ValueError(f"timestamp must be digits, like '000068', got {timestamp!r}")
+    check_timestamp(timestamp)
     if objects.track_id is None or (objects.track_id < 0).any():
         raise ValueError("objects must have a track_id, >= 0")
-    try:
-        pose = rigid_SE3(world_SE3_lidar)
-    except ValueError as error:
-        raise ValueError(f"world_SE3_lidar {error}") from None
+    pose = rigid_SE3(world_SE3_lidar, "world_SE3_lidar")
     center, yaw = objects.center, np.rad2deg(objects.yaw)
     if left_handed:
         pose, center, yaw = mirrored(pose), center * [1.0, -1.0, 1.0], -yaw

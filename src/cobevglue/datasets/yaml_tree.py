@@ -17,7 +17,7 @@ from cobevglue.datasets.frame import AgentFrame, Dataset, Frame, Scenario, did_y
 from cobevglue.datasets.safe_yaml import read_yaml
 from cobevglue.typing import ArrayLike, Float32Array, FloatArray
 
-__all__ = ["ObjectTable", "YamlTree", "read_objects"]
+__all__ = ["ObjectTable", "YamlTree", "check_timestamp", "read_objects"]
 
 LabelReader = Callable[[Path], tuple[FloatArray, Boxes]]
 
@@ -104,6 +104,16 @@ class YamlTree(Dataset):
 
     def _read_points_if_any(self, path: Path) -> Float32Array | None:
         return self._read_points(path) if path.is_file() else None
+
+
+def check_timestamp(timestamp: str) -> None:
+    """Refuse a name that no frame can have.
+
+    Raises:
+        ValueError: it is not all digits.
+    """
+    if not _is_timestamp(timestamp):
+        raise ValueError(f"timestamp must be digits, like '000068', got {timestamp!r}")
 
 
 class ObjectTable:
@@ -202,8 +212,12 @@ def _subfolders(folder: Path) -> list[str]:
         return sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
 
 
+def _is_timestamp(stem: str) -> bool:
+    return stem.isascii() and stem.isdigit()
+
+
 def _timestamps(folder: Path) -> frozenset[str]:
     """Names of the frames of an agent; other yaml files (`additional`, `camera_gt`) are no frames."""
     with os.scandir(folder) as entries:
         stems = (entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
-        return frozenset(stem for stem in stems if stem.isascii() and stem.isdigit())
+        return frozenset(stem for stem in stems if _is_timestamp(stem))

@@ -22,9 +22,10 @@ from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Target
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
 from cobevglue.torch_threads import torch_threads
-from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
+from cobevglue.training.checkpoint import LAST, begin_run
 from cobevglue.training.config import settings_from
 from cobevglue.training.detector import TrainingResult
+from cobevglue.training.epochs import run_epochs
 from cobevglue.training.fusion_features import FeatureConfig, FusionFrame, FusionFrames, write_features
 from cobevglue.training.loader import batches
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
@@ -162,28 +163,26 @@ def _train(config: TrainFusionConfig, folder: Path, resume: bool, report: Callab
 
     loss, anchors = DetectionLoss(detector.config), AnchorGrid(detector.config)
     learner = Learner(model, optimisation, state)
-    first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
-    batches = optimisation.steps_per_epoch()
     noise = config.noise if config.noise is not None else model.training_noise
-    metrics: dict[str, float] = {}
-    folder.mkdir(parents=True, exist_ok=True)
-    with RunLog(folder, first * batches) as log:
-        for epoch in range(first, optimisation.epochs):
-            started = time.monotonic()
-            rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
-            rounds = -(-batches * optimisation.batch_size // len(frames))
-            order = np.concatenate([rng.permutation(len(frames)) for _ in range(rounds)])
-            order = order[: batches * optimisation.batch_size]
-            seed = (config.seed, _SAMPLE_STREAM, epoch)
-            merged = model.learns_from_merged_clouds
-            samples = _Samples(frames, order.tolist(), noise, config.alone, merged, seed, anchors)
-            _train_epoch(config, samples, learner, loss, epoch, log, report)
-            if epoch + 1 == optimisation.epochs and len(validation):
-                metrics = _validate(learner.mean, validation, report)
-                log.add("validation", (epoch + 1) * batches, epoch + 1, metrics)
-            elapsed += time.monotonic() - started
-            learner.mean.save(folder / LAST, _metadata(config, epoch + 1, elapsed, metrics))
-            save_state(folder / STATE, learner.state(config, epoch + 1, elapsed))
+    count = optimisation.steps_per_epoch() * optimisation.batch_size
+
+    def train(epoch: int, log: RunLog) -> None:
+        seed = (config.seed, _SAMPLE_STREAM, epoch)
+        rng = np.random.default_rng(seed)
+        order = np.concatenate([rng.permutation(len(frames)) for _ in range(-(-count // len(frames)))])[:count]
+        merged = model.learns_from_merged_clouds
+        samples = _Samples(frames, order.tolist(), noise, config.alone, merged, seed, anchors)
+        _train_epoch(config, samples, learner, loss, epoch, log, report)
+
+    metrics = run_epochs(
+        config,
+        folder,
+        learner,
+        state,
+        train=train,
+        validate=lambda: _validate(learner.mean, validation, report) if len(validation) else {},
+        save=lambda metadata: learner.mean.save(folder / LAST, metadata),
+    )
     return TrainingResult(folder, optimisation.epochs, True, metrics, metrics.get("ap_0.7"))
 
 
@@ -264,12 +263,6 @@ def _make_model(config: TrainFusionConfig, detector: PointPillars) -> Intermedia
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = _NORM_MOMENTUM
     return model
-
-
-def _metadata(config: TrainFusionConfig, epoch: int, elapsed: float, metrics: dict[str, float]) -> dict[str, object]:
-    known = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-    training = config.model_dump(mode="json")
-    return {**provenance(), "training": training, "epoch": epoch, "seconds": round(elapsed), "metrics": known}
 
 
 _DEFAULT = TrainFusionConfig.model_fields["optimisation"].default

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +17,10 @@ from cobevglue.perception.heading import HeadingInputs, HeadingRefiner
 from cobevglue.settings import Settings
 from cobevglue.torch_device import chosen_device
 from cobevglue.torch_threads import torch_threads
-from cobevglue.training.checkpoint import LAST, STATE, begin_run, provenance, save_state
+from cobevglue.training.checkpoint import LAST, begin_run
 from cobevglue.training.config import DataConfig, settings_from
 from cobevglue.training.detector import TrainingResult
+from cobevglue.training.epochs import run_epochs
 from cobevglue.training.heading_examples import HeadingExamples, write_heading_examples
 from cobevglue.training.optimisation import Learner, OptimisationConfig, autocast
 from cobevglue.training.progress import EpochProgress
@@ -126,7 +126,6 @@ def train_heading(
 def _train(
     config: TrainHeadingConfig, folder: Path, resume: bool, device: torch.device, report: Callable[[str], None]
 ) -> TrainingResult:
-    optimisation = config.optimisation
     detector = PointPillars.named(config.detector)
     # How the detector came about stays known; of an earlier heading refinement nothing is left.
     earlier = detector.metadata.get("stages", [detector.metadata])
@@ -139,25 +138,22 @@ def _train(
         net = HeadingRefiner().to(device)
     if config.init_from is not None:
         net.load_state_dict(PointPillars.named(config.init_from).heading_refiner.state_dict())
-    learner = Learner(net, optimisation, state)
-    first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
-    metrics: dict[str, float] = {}
-    folder.mkdir(parents=True, exist_ok=True)
-    steps = optimisation.steps_per_epoch()
-    with RunLog(folder, first * steps) as log:
-        for epoch in range(first, optimisation.epochs):
-            started = time.monotonic()
-            _train_epoch(config, training, learner, epoch, log, report)
-            if epoch + 1 == optimisation.epochs:
-                metrics = _measure(learner.mean, validation)
-                log.add("validation", (epoch + 1) * steps, epoch + 1, metrics)
-                report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
-            elapsed += time.monotonic() - started
-            detector.heading_refiner.load_state_dict(learner.mean.state_dict())
-            known = {"stage": _STAGE, "training": config.model_dump(mode="json"), "epoch": epoch + 1}
-            detector.save(folder / LAST, {**provenance(), **known, "seconds": round(elapsed), "metrics": metrics})
-            save_state(folder / STATE, learner.state(config, epoch + 1, elapsed))
-    return TrainingResult(folder, optimisation.epochs, True, metrics, None)
+    learner = Learner(net, config.optimisation, state)
+
+    def save(metadata: dict[str, object]) -> None:
+        detector.heading_refiner.load_state_dict(learner.mean.state_dict())
+        detector.save(folder / LAST, {"stage": _STAGE, **metadata})
+
+    metrics = run_epochs(
+        config,
+        folder,
+        learner,
+        state,
+        train=lambda epoch, log: _train_epoch(config, training, learner, epoch, log, report),
+        validate=lambda: _validate(learner.mean, validation, report),
+        save=save,
+    )
+    return TrainingResult(folder, config.optimisation.epochs, True, metrics, None)
 
 
 def _examples(
@@ -234,16 +230,18 @@ def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.G
 
 
 @torch.inference_mode()
-def _measure(net: HeadingRefiner, examples: HeadingExamples) -> dict[str, float]:
+def _validate(net: HeadingRefiner, examples: HeadingExamples, report: Callable[[str], None]) -> dict[str, float]:
     """The loss, and the share of vehicles that are the wrong way round, without heading refinement and with it."""
     right = examples.right
     every = torch.arange(len(right), device=right.device)
     logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(every, 1024)])
-    return {
+    metrics = {
         "loss": float(F.binary_cross_entropy_with_logits(logits, right.float())),
         "flipped_before": float((~right).float().mean()),
         "flipped": float(((logits >= 0) != right).float().mean()),
     }
+    report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    return metrics
 
 
 HEADING_PRESETS: dict[str, TrainHeadingConfig] = {

@@ -125,6 +125,7 @@ class Learner(Generic[Model]):
     Attributes:
         model: what is trained.
         mean: what is validated and saved.
+        config: how.
     """
 
     def __init__(self, model: Model, config: OptimisationConfig, state: RunState | None = None) -> None:
@@ -135,7 +136,7 @@ class Learner(Generic[Model]):
             config: how.
             state: of the run to go on with.
         """
-        self.model, self._config = model, config
+        self.model, self.config = model, config
         if state is not None:
             model.load_state_dict(state.model)
         self._mean = MeanWeights(model, config.mean_decay)
@@ -151,12 +152,12 @@ class Learner(Generic[Model]):
         Returns:
             The learning rate, and the length of the gradient before it was clipped.
         """
-        rate = learning_rate(step, steps, self._config)
+        rate = learning_rate(step, steps, self.config)
         for group in self._optimizer.param_groups:
             group["lr"] = rate
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self._config.clip)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip)
         self._optimizer.step()
         self._mean.update(self.model, step)
         return rate, norm.detach()
