@@ -30,13 +30,13 @@ __all__ = ["CoBEVGlue", "StepOutput"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepOutput:
-    """What the ego knows after one frame.
+    """The result of one frame.
 
     Attributes:
-        boxes: the vehicles around the ego, itself excluded, with score, in its LiDAR frame, best first.
-        alignments: the pose of every other agent, or why there is none; one that was refused took no part.
-        message_bytes: what each other agent sent, as encoded: {"boxes": …, "features": …}, and "points", "pose" or
-            "variance" where such things were sent.
+        boxes: the detected vehicles without the ego itself, with score, in its LiDAR frame, best first.
+        alignments: of every other agent; those refused are not fused.
+        message_bytes: encoded size of each other agent's messages: {"boxes": …, "features": …}, and "points", "pose" or
+            "variance" where such data were sent.
         alignment_bytes: the part of it that was sent for alignment.
         seconds: time spent in each stage [s]; perception is the sum over agents.
     """
@@ -49,14 +49,14 @@ class StepOutput:
 
 
 class CoBEVGlue:
-    """Several agents that see together.
+    """Collaborative perception of several agents (equation 1 of the paper).
 
     All agents run the same detector; each has a tracker of its own. Agents may come and go from frame to frame.
 
     Args:
         detector: from points to features and boxes.
-        fusion: how what agents saw is put together.
-        aligner: where the poses of the others come from.
+        fusion: the fusion method.
+        aligner: the source of relative poses.
     """
 
     def __init__(self, detector: PointPillars, fusion: FusionMethod, aligner: GroupAligner) -> None:
@@ -72,17 +72,17 @@ class CoBEVGlue:
         Args:
             name: of the detector: "compact", or "opv2v", for which fusion has to be "late", "early" or "none".
             fusion: a name in `FUSION_METHODS`.
-            aligner: a name in `ALIGNERS`; None for the one that the method's paper has.
+            aligner: a name in `ALIGNERS`; None for that of the method's paper.
 
         Raises:
-            ValueError: there is no such thing; names the nearest.
+            ValueError: an unknown name; names the nearest.
         """
         detector = PointPillars.pretrained(name)
         method = pretrained_fusion(fusion, detector, name)
         return cls(detector, method, group_aligner(aligner or method.usual_aligner))
 
     def reset(self) -> None:
-        """Forget all tracks and poses: the next frame is the first of another drive."""
+        """Forget all tracks and poses: the next frame is the first of another sequence."""
         self._perception.clear()
         self.aligner.reset()
         self._ego, self._frame = None, 0
@@ -99,7 +99,7 @@ class CoBEVGlue:
 
         Args:
             points: (N, 4) x, y, z [m], intensity of every agent's cloud, each in its own LiDAR frame.
-            ego: the agent whose view is asked for.
+            ego: the agent in whose frame the result is.
             time: of the clouds [s]; by default 0.1 s after the last.
             poses: (4, 4) world_SE3_lidar of every agent as its localisation claims, for aligners that need one; may be
                 left out with fusion "none", which needs none: all others are then refused.
@@ -118,7 +118,7 @@ class CoBEVGlue:
         return self.collaborate(seen, ego, time, poses, seconds, bodies)
 
     def perceive(self, agent: str, points: ArrayLike, time: float | None = None) -> PerceptionOutput:
-        """Equation (1a): what one agent sees by itself. See `step` for the arguments."""
+        """Equation (1a): the perception of one agent. See `step` for the arguments."""
         perception = self._perception.setdefault(agent, Perception(self.detector))
         try:
             return perception.step(points, time)
@@ -134,8 +134,8 @@ class CoBEVGlue:
         seconds: Mapping[str, float] | None = None,
         bodies: Mapping[str, Boxes] | None = None,
     ) -> StepOutput:
-        """Equations (1b) to (1e): from what each agent saw to what the ego knows. See `step` for the arguments."""
-        if ego != self._ego:  # poses of the others are remembered in the ego's frame
+        """Equations (1b) to (1e): from the agents' observations to the ego's result. See `step` for the arguments."""
+        if ego != self._ego:  # aligners filter the poses in the ego frame
             self.aligner.reset()
             self._ego = ego
         spent = dict(seconds or {})
@@ -162,7 +162,7 @@ class CoBEVGlue:
 
         with _timed("fusion", spent):
             boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
-            boxes = vote_headings(boxes, _told(seen[ego], observations, alignments))
+            boxes = vote_headings(boxes, _transmitted(seen[ego], observations, alignments))
             boxes = boxes[~covers_origin(boxes)]  # others see the ego, too
             boxes = boxes.replace(center=boxes.center - (0.0, 0.0, seen[ego].height_correction))
         self._frame += 1
@@ -177,7 +177,7 @@ class CoBEVGlue:
         bodies: Mapping[str, Boxes],
         sent: dict[str, dict[str, int]],
     ) -> dict[str, Observation]:
-        """What the aligner is given of every agent: of others, what arrived. Counts the bytes into `sent`."""
+        """The aligner's inputs: for other agents, as decoded from messages, whose bytes are added to `sent`."""
         observations = {}
         for agent, view in seen.items():
             pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
@@ -194,10 +194,10 @@ class CoBEVGlue:
         return observations
 
 
-def _told(
+def _transmitted(
     ego: PerceptionOutput, observations: Mapping[str, Observation], alignments: Mapping[str, Alignment]
 ) -> Iterator[Boxes]:
-    """The ego's own boxes, and those that arrived from agents whose pose is known, in the ego's frame."""
+    """The ego's own boxes, and the received boxes of aligned agents, in the ego frame."""
     yield ego.boxes
     for agent, alignment in alignments.items():
         boxes = observations[agent].boxes

@@ -179,9 +179,9 @@ def test_a_message_is_made_once_for_a_view(settings: StudySettings) -> None:
     class Counting(LateFusion):
         made = 0
 
-        def message(self, seen: PerceptionOutput) -> Arrays:
+        def message(self, observation: PerceptionOutput) -> Arrays:
             self.made += 1
-            return super().message(seen)
+            return super().message(observation)
 
     models = Models(settings)
     from cobevglue.experiments.observed_sequence import ObservedSequence

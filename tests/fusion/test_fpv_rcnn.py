@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cobevglue import Boxes
 from cobevglue.fusion import FusionSample, Received, fusion_class
-from cobevglue.fusion.fpv_rcnn import FPVRCNN, _Told
+from cobevglue.fusion.fpv_rcnn import FPVRCNN, _Message
 from cobevglue.fusion.fpv_rcnn_keypoints import select_keypoints, spread
 from cobevglue.fusion.fpv_rcnn_proposals import decode_refinement, encode_refinement, merge_proposals
 from cobevglue.fusion.fpv_rcnn_roi import RoIHead
@@ -307,7 +307,7 @@ def test_proposals_and_keypoints_move_with_their_agent() -> None:
     proposals = np.column_stack([moved.center, moved.size, moved.yaw, rows[:, 7]]).astype(np.float32)
     keypoints = turn.inverse().apply(message["keypoints"]).astype(np.float32)
     away = Received({**message, "proposals": proposals, "keypoints": keypoints}, turn)
-    assert method._read(away).heading == pytest.approx(1.0)
+    assert method._decode(away).heading == pytest.approx(1.0)
     here = method.fuse(ego, [checks.sent(method, ego, SE2())])
     wrong = method.fuse(ego, [Received(away.content, SE2(31.0, -4.0, 1.0))])
     assert len(wrong) != len(here) or np.abs(wrong.bev - here.bev).max() > 0.1
@@ -366,7 +366,7 @@ def test_both_halves_of_a_bus_are_trained() -> None:
     method, loss = method_with_weights(), DetectionLoss(checks.SMALL)
     halves = cars((-2.3, 0.0, 0.0, 0.9), (2.3, 0.0, 0.0, 0.8))
     bus = Boxes([[0.0, 0.0, -1.0]], [[9.2, 1.9, 1.6]], [0.0], track_id=[7])
-    told = _Told(halves, np.zeros((0, 3), np.float32), torch.zeros(0, 32))
+    told = _Message(halves, np.zeros((0, 3), np.float32), torch.zeros(0, 32))
     _, _, proposals, right = method._second_loss([told], bus, loss)
     assert (int(proposals), int(right)) == (2, 2)
 

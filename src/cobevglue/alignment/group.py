@@ -1,7 +1,7 @@
-"""Sources of relative poses as the whole system sees them: from all agents' observations to the ego's view of each.
+"""The interface of aligners in the system: from all agents' observations to their poses in the ego frame.
 
-Aligners differ in what they look at. Each says so (`needs`), and is given nothing else: one that localises by itself
-never holds a pose that somebody claimed.
+Aligners differ in their inputs. Each declares them (`needs`, `accepts`) and receives nothing else: a self-localised
+method never has access to a claimed pose.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 __all__ = ["GroupAligner", "Need", "Observation", "Pairwise"]
 
 Need = Literal["boxes", "body", "variance", "points", "features", "pose"]
-"""What an aligner may look at; fields of `Observation`."""
+"""Inputs of aligners; fields of `Observation`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What one agent has to tell in one frame; all in its own LiDAR frame. None is what was not told.
+    """The data of one agent in one frame, in its own LiDAR frame; None where not transmitted.
 
     Attributes:
         boxes: its tracked objects.
@@ -37,7 +37,7 @@ class Observation:
         variance: (K, 3) of x, y [m^2] and yaw [rad^2] of the K boxes.
         points: (N, 4) x, y, z [m], intensity.
         features: the detector's three maps (C, H, W).
-        pose: (4, 4) world_SE3_lidar as the agent claims it, from whatever localisation: noisy, or a lie.
+        pose: (4, 4) world_SE3_lidar as claimed by the agent's localisation, possibly noisy or false.
     """
 
     boxes: Boxes | None = None
@@ -49,7 +49,7 @@ class Observation:
 
 
 class GroupAligner(ABC):
-    """A source of the poses of all other agents in the ego's frame. It may remember; one is needed for each ego.
+    """A source of the poses of all other agents in the ego frame. It may keep a state: use one for each ego.
 
     Attributes:
         needs: the fields of an observation that it uses.
@@ -63,7 +63,7 @@ class GroupAligner(ABC):
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
     ) -> dict[str, Alignment]:
-        """The poses of all agents but the ego in the ego's frame, each accepted or refused.
+        """The poses of all other agents in the ego frame, each accepted or refused.
 
         Args:
             ego: its name.
@@ -71,14 +71,14 @@ class GroupAligner(ABC):
             time: of the frame [s]; by default 0.1 s after the last.
         """
 
-    def reset(self) -> None:  # noqa: B027  # not abstract: most remember nothing
-        """Forget everything seen so far; nothing to do for those that remember nothing."""
+    def reset(self) -> None:  # noqa: B027  # not abstract: most have no state
+        """Forget all frames; does nothing for aligners without a state."""
 
     def select_inputs(self, observation: Observation) -> Observation:
-        """The part of an observation that this aligner is given.
+        """The part of an observation that this aligner uses.
 
         Raises:
-            ValueError: it lacks something that is needed, such as a pose; says what.
+            ValueError: a needed field, such as the pose, is missing; names it.
         """
         missing = [name for name in sorted(self.needs) if getattr(observation, name) is None]
         if missing:
@@ -86,7 +86,7 @@ class GroupAligner(ABC):
         return Observation(**{name: getattr(observation, name) for name in self.needs | self.accepts})
 
     def encode(self, agent: str, observation: Observation, time: float, frame: int) -> dict[str, bytes]:
-        """The messages by which an agent tells the others what this aligner needs of it, by kind.
+        """The messages that transmit the inputs of this aligner, by kind.
 
         Features are not among them: methods that align by them share them for fusion anyway.
         """
@@ -101,7 +101,7 @@ class GroupAligner(ABC):
         return parts
 
     def decode(self, parts: Mapping[str, bytes], observation: Observation) -> Observation:
-        """What the ego reads in the messages of another agent (`observation` has what does not travel by itself)."""
+        """The observation decoded from messages; fields that do not travel come from `observation`."""
         received: dict[str, Any] = {name: decode_arrays(data)[name] for name, data in parts.items() if name != "boxes"}
         if "boxes" in parts:
             message = decode(parts["boxes"])
@@ -110,13 +110,13 @@ class GroupAligner(ABC):
 
 
 class Pairwise(GroupAligner):
-    """One aligner of boxes for each collaborator, which it remembers."""
+    """One aligner of boxes for each collaborator."""
 
     needs = frozenset({"boxes"})
     accepts = frozenset({"body"})
 
     def __init__(self, make_aligner: Callable[[], Aligner]) -> None:
-        """Nothing is made before a collaborator is first met.
+        """Aligners are made when a collaborator first appears.
 
         Args:
             make_aligner: makes an aligner for a new collaborator: `BEVGlue` for example.
@@ -127,7 +127,7 @@ class Pairwise(GroupAligner):
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
     ) -> dict[str, Alignment]:
-        """Each collaborator by itself."""
+        """Align each collaborator independently."""
         own = observations[ego]
         assert own.boxes is not None
         found = {}

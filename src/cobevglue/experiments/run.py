@@ -149,15 +149,15 @@ class MessageMemo(FusionMethod):
         """Forget the messages."""
         self._made.clear()
 
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """The method's message."""
-        if id(seen) in self._made:
-            _, message, seconds = self._made[id(seen)]
+        if id(observation) in self._made:
+            _, message, seconds = self._made[id(observation)]
             self.saved += seconds
             return message
         start = perf_counter()
-        message = self._method.message(seen)
-        self._made[id(seen)] = seen, message, perf_counter() - start  # what is kept keeps its id
+        message = self._method.message(observation)
+        self._made[id(observation)] = observation, message, perf_counter() - start  # what is kept keeps its id
         return message
 
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:

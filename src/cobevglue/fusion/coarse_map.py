@@ -44,9 +44,9 @@ class CoarseMapFusion(IntermediateFusion):
         return [self.down(own), own]
 
     @torch.inference_mode()
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """The map at stride 4 (C, H, W) in float16."""
-        return {"map0": super().message(seen)["map0"]}
+        return {"map0": super().message(observation)["map0"]}
 
     def received_maps(self, content: Arrays) -> list[Tensor]:
         """The map at stride 4, and zeros for the one that was not sent."""

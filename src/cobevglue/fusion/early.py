@@ -23,9 +23,9 @@ class EarlyFusion(FusionMethod):
     def __init__(self, detector: PointPillars) -> None:
         self.detector = detector
 
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """(N, 4) float32: x, y, z [m] in the sender's LiDAR frame, and intensity."""
-        return {"points": seen.points}
+        return {"points": observation.points}
 
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
         """What the detector finds in the merged cloud."""

@@ -1,4 +1,4 @@
-"""FPV-RCNN (Yuan et al., RA-L 2022): agents share what they detected and features of some points on it.
+"""FPV-RCNN (Yuan et al., RA-L 2022): agents share proposals and keypoints with features.
 
 With these, the ego refines the proposals of all agents in a second stage. The paper is "Keypoints-Based Deep Feature
 Fusion for Cooperative Vehicle Detection of Autonomous Driving".
@@ -34,22 +34,22 @@ from cobevglue.typing import Float32Array, IntArray
 __all__ = ["FPVRCNN"]
 
 _KEYPOINTS = 1024
-"""Most of an agent; the paper has 2048 before those outside proposals are dropped."""
+"""Maximum number for an agent; the paper has 2048 before those outside proposals are dropped."""
 _FEATURES = 32
-"""Of a keypoint; the fewest that the paper tries, with hardly a loss."""
+"""Channels of a keypoint; the smallest number in the paper, with hardly a loss."""
 _MARGIN = 0.3
-"""By how much proposals are enlarged on every side [m], to have the points of what they missed."""
+"""Enlargement of proposals on every side when their points are collected [m]."""
 _SAME_OBJECT = 0.15
-"""Rotated overlap from which on two agents' proposals are of one object: that of non-maximum suppression."""
+"""Minimum IoU of two agents' proposals of one object: that of non-maximum suppression."""
 _RIGHT = 0.3
-"""Overlap with an object from which on a proposal learns to become it. With poses that are off, few overlap by more."""
+"""Minimum IoU with an object for a proposal to be regressed to it. With pose errors few overlap by more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Told:
-    """What one agent tells: boxes with scores, (K, 3) keypoints [m] in the same frame, (K, F) features.
+class _Message:
+    """The message of one agent: proposals with scores, (K, 3) keypoints [m] in the same frame, (K, F) features.
 
-    `heading` is the agent's own in that frame [rad]: features say directions in the agent's.
+    `heading` is the agent's own in that frame [rad]: features encode directions relative to it.
     """
 
     proposals: Boxes
@@ -57,7 +57,7 @@ class _Told:
     features: Tensor
     heading: float = 0.0
 
-    def seen_from(self, ego_SE2_other: SE2) -> _Told:
+    def transform(self, ego_SE2_other: SE2) -> _Message:
         return replace(
             self,
             proposals=self.proposals.transform(ego_SE2_other),
@@ -67,13 +67,13 @@ class _Told:
 
 
 class FPVRCNN(SingleMapFusion):
-    """Two stages. The first is every agent's own: what its head finds in its own map are its proposals.
+    """A two-stage detector. The first stage is single-agent: each agent's detections are its proposals.
 
-    In the second, proposals of all agents are merged, and what the keypoints in each say decides where it is and how
-    likely an object. A message has up to `detection.max_detections` proposals of 32 bytes and 1024 keypoints of 76.
+    In the second, the proposals of all agents are merged; each is scored and refined from the keypoints in it. A
+    message has up to `detection.max_detections` proposals of 32 bytes and 1024 keypoints of 76.
 
     Attributes:
-        proposal_score: detections that score less are no proposals.
+        proposal_score: minimum score of a proposal.
     """
 
     usual_aligner = "fpv-rcnn"
@@ -85,7 +85,7 @@ class FPVRCNN(SingleMapFusion):
         self.second_stage = RoIHead(_FEATURES, _MARGIN)
 
     def conditioned_channels(self) -> Sequence[int]:
-        """None: no maps are shared, and the second stage turns what keypoints say."""
+        """None: no maps are shared, and the second stage is rotation-conditioned itself."""
         return []
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
@@ -93,21 +93,21 @@ class FPVRCNN(SingleMapFusion):
         return [maps[0][0]]
 
     @torch.inference_mode()
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """Proposals and keypoints in the sender's LiDAR frame, and the keypoints' features.
 
         (P, 8) float32 x, y, z, l, w, h [m], yaw [rad], score; (K, 3) float32 x, y, z [m]; (K, F) float16.
         """
-        told = self._look(seen)
-        assert told.proposals.score is not None
-        proposals = np.column_stack([_rows(told.proposals), told.proposals.score]).astype(np.float32)
-        return {"proposals": proposals, "keypoints": told.keypoints, "features": _half(told.features)}
+        own = self._own_message(observation)
+        assert own.proposals.score is not None
+        proposals = np.column_stack([_rows(own.proposals), own.proposals.score]).astype(np.float32)
+        return {"proposals": proposals, "keypoints": own.keypoints, "features": _half(own.features)}
 
     @torch.inference_mode()
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
         """The merged proposals after the second stage, best first."""
-        told = [self._look(ego), *(self._read(other) for other in received)]
-        proposals, _, logits, refinement = self._second_stage(told)
+        messages = [self._own_message(ego), *(self._decode(other) for other in received)]
+        proposals, _, logits, refinement = self._second_stage(messages)
         boxes = decode_refinement(refinement.double().cpu().numpy(), proposals)
         boxes = boxes.replace(score=logits.sigmoid().double().cpu().numpy(), label=np.full(len(boxes), LABEL))
         assert boxes.score is not None
@@ -122,67 +122,69 @@ class FPVRCNN(SingleMapFusion):
         overlap an object well enough. They are weighted as classification and box are.
 
         Raises:
-            ValueError: a sample comes without its truth.
+            ValueError: a sample has no ground truth.
         """
-        agents = [seen for sample in samples for seen in sample.observations]
-        maps = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
+        agents = [one for sample in samples for one in sample.observations]
+        maps = self.share([torch.stack(scale) for scale in zip(*(one.features for one in agents), strict=True)])
         output = self.decode_maps(maps)
         first = np.cumsum([0, *(len(sample.observations) for sample in samples[:-1])]).tolist()
         terms = loss(HeadOutput(*(values[first] for values in output)), targets)._asdict()
 
-        told = self._told(maps[0], output, agents)
+        messages = self._messages(maps[0], output, agents)
         losses = []
         for start, sample in zip(first, samples, strict=True):
             if sample.truth is None:
                 raise ValueError("truth: FPV-RCNN's second stage learns from the objects of a sample, got None")
-            moved = [t.seen_from(pose) for t, pose in zip(told[start:], sample.ego_SE2_agent, strict=False)]
+            moved = [
+                message.transform(pose) for message, pose in zip(messages[start:], sample.ego_SE2_agent, strict=False)
+            ]
             losses.append(self._second_loss(moved, sample.truth, loss))
         score, box, proposals, right = (torch.stack(values).sum() for values in zip(*losses, strict=True))
         score, box = score / proposals.clamp(min=1.0), box / right.clamp(min=1.0)
         total = terms["total"] + loss.weights.classification * score + loss.weights.box * box
         return {**terms, "total": total, "second_score": score, "second_box": box}
 
-    def _look(self, seen: PerceptionOutput) -> _Told:
-        maps = self.share([m[None] for m in seen.features])
-        (told,) = self._told(maps[0], self.decode_maps(maps), [seen])
-        return told
+    def _own_message(self, observation: PerceptionOutput) -> _Message:
+        maps = self.share([m[None] for m in observation.features])
+        (message,) = self._messages(maps[0], self.decode_maps(maps), [observation])
+        return message
 
-    def _told(self, maps: Tensor, output: HeadOutput, agents: Sequence[PerceptionOutput]) -> list[_Told]:
-        """What each agent has to tell, by its map (B, C, H, W) and what the head says of it."""
+    def _messages(self, maps: Tensor, output: HeadOutput, agents: Sequence[PerceptionOutput]) -> list[_Message]:
+        """The message of each agent, from its map (B, C, H, W) and the head's output."""
         proposing = self.detection.model_copy(update={"score_threshold": self.proposal_score})
         found = decode(HeadOutput(*(values.detach() for values in output)), self.anchors, proposing)
-        told = []
-        for shared, seen, (proposals, *_) in zip(maps, agents, found, strict=True):
+        messages = []
+        for shared, observation, (proposals, *_) in zip(maps, agents, found, strict=True):
             proposals = proposals.replace(label=None)
-            keypoints = select_keypoints(seen.points, proposals, _MARGIN, _KEYPOINTS)
-            told.append(_Told(proposals, keypoints, self.describe(self._at(keypoints, shared))))
-        return told
+            keypoints = select_keypoints(observation.points, proposals, _MARGIN, _KEYPOINTS)
+            messages.append(_Message(proposals, keypoints, self.describe(self._at(keypoints, shared))))
+        return messages
 
     def _at(self, points: Float32Array, shared: Tensor) -> Tensor:
-        """(K, C) features of a map (C, H, W) where these points (K, 3) are: bilinear, 0 outside."""
+        """(K, C) features of a map (C, H, W) at points (K, 3): bilinear, 0 outside."""
         low, high = np.array([self.config.x_range, self.config.y_range]).T
         place = torch.from_numpy((points[:, :2] - low) / (high - low) * 2.0 - 1.0).to(shared)
         return F.grid_sample(shared[None], place[None, None], align_corners=False)[0, :, 0].T
 
-    def _read(self, received: Received) -> _Told:
+    def _decode(self, received: Received) -> _Message:
         rows = received.content["proposals"].astype(np.float64)
         proposals = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7])
         features = torch.from_numpy(received.content["features"].astype(np.float32)).to(self.describe.weight)
-        return _Told(proposals, received.content["keypoints"], features).seen_from(received.ego_SE2_other)
+        return _Message(proposals, received.content["keypoints"], features).transform(received.ego_SE2_other)
 
-    def _second_stage(self, told: Sequence[_Told]) -> tuple[Boxes, IntArray, Tensor, Tensor]:
-        """The R merged proposals, how many each is made of, logits (R,) and refinements (R, 7)."""
-        proposals, count = merge_proposals(Boxes.concatenate([t.proposals for t in told]), _SAME_OBJECT)
-        features = torch.cat([t.features for t in told])
-        keypoints = np.concatenate([t.keypoints for t in told])
-        headings = np.repeat([t.heading for t in told], [len(t.keypoints) for t in told])
+    def _second_stage(self, messages: Sequence[_Message]) -> tuple[Boxes, IntArray, Tensor, Tensor]:
+        """The R merged proposals, the number of proposals merged into each, logits (R,) and refinements (R, 7)."""
+        proposals, count = merge_proposals(Boxes.concatenate([t.proposals for t in messages]), _SAME_OBJECT)
+        features = torch.cat([t.features for t in messages])
+        keypoints = np.concatenate([t.keypoints for t in messages])
+        headings = np.repeat([t.heading for t in messages], [len(t.keypoints) for t in messages])
         inputs = (features.new_tensor(v) for v in (_rows(proposals), proposals.score, count, keypoints, headings))
         logits, refinement = self.second_stage(*inputs, features)
         return proposals, count, logits, refinement
 
-    def _second_loss(self, told: Sequence[_Told], truth: Boxes, loss: DetectionLoss) -> tuple[Tensor, ...]:
+    def _second_loss(self, messages: Sequence[_Message], truth: Boxes, loss: DetectionLoss) -> tuple[Tensor, ...]:
         """Sums over the proposals of one sample: of both terms, of proposals, and of those that overlap an object."""
-        proposals, _, logits, refinement = self._second_stage(told)
+        proposals, _, logits, refinement = self._second_stage(messages)
         truth = truth[truth.size[:, 2] > 0.0].replace(track_id=None)  # an unknown height cannot be learned
         if not len(proposals) or not len(truth):
             zero = logits.new_zeros(())

@@ -1,4 +1,4 @@
-"""FPV-RCNN's proposals: those of all agents merged, and boxes told relative to them."""
+"""FPV-RCNN's proposals: merging those of all agents, and boxes encoded relative to them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cobevglue.typing import FloatArray, IntArray
 __all__ = ["decode_refinement", "encode_refinement", "merge_proposals"]
 
 _LARGEST = 1.0
-"""Refinements of size are cut here: the second stage makes no box more than e times larger."""
+"""Limit of the logarithmic refinement of a size: the second stage makes no box more than e times larger."""
 
 
 def merge_proposals(boxes: Boxes, min_iou: float) -> tuple[Boxes, IntArray]:
@@ -22,14 +22,14 @@ def merge_proposals(boxes: Boxes, min_iou: float) -> tuple[Boxes, IntArray]:
 
     The best-scored proposal that is left takes all that overlap it, and so on; equal scores go by row order. Centre,
     size and heading are means of the members, weighted by their scores. Headings are compared modulo pi, as an agent
-    may have mistaken front and back, and which way the merged box faces is put to the vote. Its score is the best.
+    may have confused front and back; the direction of the merged box is decided by a vote. Its score is the best.
 
     Args:
         boxes: N boxes with scores, of all agents, in one frame.
-        min_iou: rotated overlap from which on two of them are of one object.
+        min_iou: minimum rotated IoU of two proposals of one object.
 
     Returns:
-        The K merged boxes, best first, and (K,) how many proposals each is made of.
+        The K merged boxes, best first, and (K,) the number of proposals merged into each.
 
     Raises:
         ValueError: the boxes have no scores.
@@ -62,10 +62,11 @@ def _mean(members: Boxes, yaw: float) -> Boxes:
 
 
 def encode_refinement(boxes: Boxes, proposals: Boxes) -> FloatArray:
-    """(K, 7) what leads from each of K proposals to the box of the same row.
+    """(K, 7) refinements from each of K proposals to the box of the same row.
 
     As the residuals of an anchor, but in the proposal's own axes: offsets along and across its heading by its diagonal
-    and upwards by its height, logarithms of the ratios of the sizes, and the turn modulo pi: facing is the proposal's.
+    and upwards by its height, logarithms of the ratios of the sizes, and the rotation modulo pi: front and back are the
+    proposal's.
     """
     offset = local_coordinates(boxes.center, proposals.center, proposals.yaw)
     diagonal = np.hypot(proposals.size[:, 0], proposals.size[:, 1])[:, None]
@@ -81,7 +82,7 @@ def encode_refinement(boxes: Boxes, proposals: Boxes) -> FloatArray:
 
 
 def decode_refinement(refinement: FloatArray, proposals: Boxes) -> Boxes:
-    """The boxes that refinements (K, 7) of K proposals tell; scores are the proposals'."""
+    """The boxes of refinements (K, 7) of K proposals; scores are the proposals'."""
     diagonal = np.hypot(proposals.size[:, 0], proposals.size[:, 1])
     along, across = refinement[:, 0] * diagonal, refinement[:, 1] * diagonal
     c, s = np.cos(proposals.yaw), np.sin(proposals.yaw)

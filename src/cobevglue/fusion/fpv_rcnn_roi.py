@@ -1,4 +1,4 @@
-"""FPV-RCNN's second stage: a closer look at each proposal, through the keypoints of all agents that lie in it."""
+"""FPV-RCNN's second stage: scores and refines each proposal from the keypoints of all agents in it."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ _HARMONICS = 2
 class RoIHead(nn.Module):
     """RoI grid pooling and fully connected layers (as in PV-RCNN, Shi et al., CVPR 2020).
 
-    A proposal is cut into cells, in its own axes. What is said of a cell is the maximum over the keypoints in it of a
-    small network that knows their features and where they are. PV-RCNN pools around each grid point within two radii,
-    so that a keypoint is looked at many times; here it counts for its own cell, which is what a CPU has time for.
+    A proposal is divided into cells along its own axes. The feature of a cell is the maximum, over the keypoints in it,
+    of a small network of their features and positions. PV-RCNN pools around each grid point within two radii, so that a
+    keypoint is used several times; here it is used in its own cell only, for speed on CPUs.
 
-    Features say directions in the frame of the agent that they are from, and a proposal is looked at in its own axes:
-    so the weights of the features are trigonometric polynomials of the angle between the two (ours, see
-    `RotationConditioning`).
+    Features encode directions in the frame of their agent, a proposal is processed in its own axes: so the weights of
+    the features are trigonometric polynomials of the angle between the two (ours, see `RotationConditioning`).
 
-    Scores are told relative to those of the proposals, so that before training they are the same.
+    Scores are predicted as offsets to those of the proposals, which are 0 before training.
 
     Args:
         features: F, of a keypoint.
-        margin: by how much a proposal is enlarged on every side [m].
+        margin: enlargement of a proposal on every side [m].
         grid: cells along length, width and height.
     """
 
@@ -55,15 +54,15 @@ class RoIHead(nn.Module):
     def forward(
         self, boxes: Tensor, score: Tensor, count: Tensor, keypoints: Tensor, headings: Tensor, features: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What to make of R proposals.
+        """Score and refine R proposals.
 
         Args:
             boxes: (R, 7) x, y, z, l, w, h [m], yaw [rad].
             score: (R,) of the proposals, 0 to 1.
-            count: (R,) how many proposals each is made of.
+            count: (R,) number of proposals merged into each.
             keypoints: (K, 3) x, y, z [m] in the same frame, of all agents.
-            headings: (K,) of the agent that each is from [rad].
-            features: (K, F) theirs.
+            headings: (K,) heading of the agent of each keypoint [rad].
+            features: (K, F) of the keypoints.
 
         Returns:
             (R,) logits of being an object, and (R, 7) refinements as `decode_refinement` takes them.
@@ -74,7 +73,7 @@ class RoIHead(nn.Module):
         return prior + self.logit(x)[:, 0], self.refinement(x)
 
     def pool(self, boxes: Tensor, keypoints: Tensor, headings: Tensor, features: Tensor) -> Tensor:
-        """(R, cells, channels) what the keypoints say of every cell of every proposal; 0 where there are none.
+        """(R, cells, channels) pooled keypoint features of every cell of every proposal; 0 in empty cells.
 
         See `forward` for the arguments.
         """
@@ -94,9 +93,9 @@ class RoIHead(nn.Module):
         angle = boxes[box, 6] - headings[keypoint]
         waves = [wave(n * angle) for n in range(1, 1 + _HARMONICS) for wave in (torch.cos, torch.sin)]
         weight = torch.stack([torch.ones_like(angle), *waves], dim=1)
-        told = self.feature(features).unflatten(1, (-1, _CHANNELS))[keypoint]  # (pairs, waves, channels)
-        told = (weight[:, :, None] * told).sum(dim=1)
-        said: Tensor = self.point(told + self.place(torch.cat([local, share - 0.5], dim=1)))
-        pooled = said.new_zeros(len(boxes) * cells, said.shape[1])
-        pooled = pooled.scatter_reduce(0, cell[:, None].expand_as(said), said, "amax")
+        rotated = self.feature(features).unflatten(1, (-1, _CHANNELS))[keypoint]  # (pairs, waves, channels)
+        rotated = (weight[:, :, None] * rotated).sum(dim=1)
+        encoded: Tensor = self.point(rotated + self.place(torch.cat([local, share - 0.5], dim=1)))
+        pooled = encoded.new_zeros(len(boxes) * cells, encoded.shape[1])
+        pooled = pooled.scatter_reduce(0, cell[:, None].expand_as(encoded), encoded, "amax")
         return pooled.view(len(boxes), cells, _CHANNELS)

@@ -1,9 +1,9 @@
-"""What the methods that share feature maps have in common.
+"""Base classes of the methods that share feature maps.
 
-The single-agent encoder stays as it is, what follows is trained for each method.
+The single-agent encoder is frozen; fusion, neck and head are trained for each method.
 
-The three maps of the backbone, one agent's each, are turned into what is shared (`share`), warped to the ego's frame,
-put together (`fuse_maps`) and decoded (`decode_maps`). A method is these three functions.
+The three maps of each agent's backbone are converted to the shared maps (`share`), warped to the ego frame, fused
+(`fuse_maps`) and decoded (`decode_maps`). A method consists of these three functions.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ _LARGEST = 65504.0  # of float16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionSample:
-    """What a method is trained on: one frame of some agents, the ego first.
+    """A training sample: one frame of some agents, the ego first.
 
     Attributes:
-        observations: what each of the n agents saw, each in its own LiDAR frame.
-        ego_SE2_agent: n poses in the ego's frame, as the ego believes them; the first is the identity.
-        true_ego_SE2_agent: the same, true.
+        observations: of the n agents, each in its own LiDAR frame.
+        ego_SE2_agent: n estimated poses in the ego frame; the first is the identity.
+        true_ego_SE2_agent: the true poses.
         early_features: the three maps of the encoder for the merged cloud of all agents (by the true poses), for
-            DiscoNet's teacher; None where they are not known.
-        truth: the objects to find, in the ego's LiDAR frame.
+            DiscoNet's teacher; None where they are unknown.
+        truth: the ground-truth objects, in the ego's LiDAR frame.
     """
 
     observations: Sequence[PerceptionOutput]
@@ -71,7 +71,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         detection: how boxes are chosen, the detector's own settings at first.
         training_noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose in training, as the
             method's paper has it.
-        learns_from_merged_clouds: whether `loss` looks at `FusionSample.early_features`.
+        learns_from_merged_clouds: whether `loss` uses `FusionSample.early_features`.
     """
 
     training_noise: ClassVar[tuple[float, float]] = (0.0, 0.0)
@@ -90,19 +90,19 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     @abstractmethod
     def conditioned_channels(self) -> Sequence[int]:
-        """Channels of the shared maps that say something of directions, the first ones of `share`."""
+        """Channels of the shared maps that are rotation-conditioned, the first ones of `share`."""
 
     @abstractmethod
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
-        """From the encoder's maps of B agents, (B, C_i, H_i, W_i) at strides 2, 4, 8, to the maps that are sent."""
+        """From the encoder's maps of B agents, (B, C_i, H_i, W_i) at strides 2, 4, 8, to the transmitted maps."""
 
     @abstractmethod
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
-        """Put together what n agents shared.
+        """Fuse the maps of n agents.
 
         Args:
-            maps: each (n, C, H, W), warped to the ego's frame, the ego first; 0 where an agent's map does not reach.
-            covered: of each map (n, 1, H, W), where it does reach: 1 inside, 0 outside.
+            maps: each (n, C, H, W), warped to the ego's frame, the ego first; 0 outside an agent's coverage.
+            covered: (n, 1, H, W) coverage of each map: 1 inside, 0 outside.
 
         Returns:
             Maps (C, H, W), as `decode_maps` takes them.
@@ -110,16 +110,16 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     @abstractmethod
     def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
-        """From fused maps of B egos, each (B, C, H, W), to what is said of every anchor."""
+        """From fused maps of B egos, each (B, C, H, W), to the predictions per anchor."""
 
     def forward(self, samples: Sequence[FusionSample]) -> HeadOutput:
-        """What is said of every anchor in the ego's frame of each of B samples."""
+        """Predictions per anchor in the ego frame of each of B samples."""
         return self.decode_maps(self.fused(samples))
 
     def fused(self, samples: Sequence[FusionSample]) -> list[Tensor]:
         """The fused maps, each (B, C, H, W), of B samples."""
-        agents = [seen for sample in samples for seen in sample.observations]
-        features = [torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)]
+        agents = [one for sample in samples for one in sample.observations]
+        features = [torch.stack(scale) for scale in zip(*(one.features for one in agents), strict=True)]
         shared = self.share(features)
         counts = [len(sample.observations) for sample in samples]
         fused = [
@@ -134,15 +134,15 @@ class IntermediateFusion(FusionMethod, nn.Module):
         return self.fuse_maps([m for m, _ in placed], [covered for _, covered in placed])
 
     def placed(self, maps: Tensor, ego_SE2_agent: Sequence[SE2], index: int) -> tuple[Tensor, Tensor]:
-        """Maps of agents, warped to the ego's frame and turned to its directions.
+        """Maps of agents, warped to the ego frame and rotation-conditioned.
 
         Args:
-            maps: (B, C, H, W) of B agents, what each shared.
-            ego_SE2_agent: B poses; the ego's own is no special case.
-            index: which of the shared maps it is.
+            maps: (B, C, H, W) shared maps of B agents.
+            ego_SE2_agent: B poses, the ego's own may be among them.
+            index: of the shared map.
 
         Returns:
-            (B, C, H, W), and how much of each cell they cover, (B, 1, H, W).
+            (B, C, H, W), and their coverage of each cell, (B, 1, H, W).
         """
         warped = warp(maps, ego_SE2_agent, self.config)
         covered = coverage(maps, ego_SE2_agent, self.config)
@@ -151,28 +151,28 @@ class IntermediateFusion(FusionMethod, nn.Module):
         return warped, covered
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
-        """What training minimises ("total"), and its parts for the log.
+        """The training loss ("total") and its parts for the log.
 
         Args:
             samples: B frames.
-            targets: what should be said of every anchor in each ego's frame.
-            loss: of a detector.
+            targets: of every anchor in each ego frame.
+            loss: the detector's loss function.
         """
         return loss(self(samples), targets)._asdict()
 
     @torch.inference_mode()
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """The shared maps (C, H, W) in float16."""
-        shared = self.share([m[None] for m in seen.features])
+        shared = self.share([m[None] for m in observation.features])
         return {f"map{i}": _half(m[0]) for i, m in enumerate(shared)}
 
     def received_maps(self, content: Arrays) -> list[Tensor]:
-        """What `message` has sent, as maps (C, H, W)."""
+        """The maps (C, H, W) of a message."""
         return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(len(content))]
 
     @torch.inference_mode()
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
-        """The boxes that the decoder finds in the fused maps."""
+        """The boxes decoded from the fused maps."""
         own = self.share([m[None] for m in ego.features])
         others = [self.received_maps(other.content) for other in received]
         maps = [torch.cat([m, *(o[i][None].to(m) for o in others)]) for i, m in enumerate(own)]
@@ -181,7 +181,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         return found.boxes
 
     def boxes(self, output: HeadOutput) -> list[Found]:
-        """What the head found for each ego, best first."""
+        """The detections of each ego, best first."""
         return decode(output, self.anchors, self.detection)
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
@@ -197,7 +197,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         save_checkpoint(path, self.architecture(), config, self, known, half)
 
     def load(self, path: str | Path) -> Self:
-        """Take the weights that `save` wrote; in evaluation mode afterwards.
+        """Load weights that `save` wrote, and switch to evaluation mode.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -216,7 +216,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     @classmethod
     def architecture(cls) -> str:
-        """What a file of weights calls this method."""
+        """The name of this method in weights files."""
         return f"fusion {cls.__name__}"
 
 

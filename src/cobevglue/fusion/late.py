@@ -23,9 +23,9 @@ class LateFusion(FusionMethod):
     def __init__(self, detector: PointPillars) -> None:
         self.detection = detector.detection
 
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """(K, 8) float32: x, y, z, l, w, h [m], yaw [rad] in the sender's LiDAR frame, and score."""
-        boxes = seen.detections
+        boxes = observation.detections
         assert boxes.score is not None
         rows = np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.score])
         return {"detections": rows.astype(np.float32)}

@@ -1,4 +1,4 @@
-"""What every way of putting together what several agents saw looks like from outside."""
+"""The interface of fusion methods."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["FusionMethod", "Received"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """What came from another agent, and where that agent is.
+    """The message of another agent, and its relative pose.
 
     Attributes:
-        content: what it sent.
-        ego_SE2_other: its pose in the ego's frame, whoever found it out.
+        content: the decoded message.
+        ego_SE2_other: its pose in the ego frame, from the aligner.
     """
 
     content: Arrays
@@ -29,15 +29,14 @@ class Received:
 
 
 class FusionMethod(ABC):
-    """Equations (1c) to (1e) of CoBEVGlue: from what all agents saw to the boxes of the ego.
+    """Equations (1c) to (1e) of CoBEVGlue: from the observations of all agents to the ego's boxes.
 
-    A method says what an agent sends to others (`message`), and what the ego makes of what it saw itself and of what it
-    received (`fuse`). Nobody to hear from is no special case: then `fuse` has only what the ego saw. Objects are made
-    as `Method(detector)`.
+    A method defines the message of an agent (`message`), and the fusion of the ego's observation with the received
+    messages (`fuse`), of which there may be none. Instances are made as `Method(detector)`.
 
     Attributes:
-        kind: what a message is made of, as communication is reported by it.
-        usual_aligner: the name of the source of poses that its paper has; "given" for the agents' localisation.
+        kind: of data in a message, by which communication volume is reported.
+        usual_aligner: name of the aligner of the method's paper; "given" for the agents' localisation.
     """
 
     kind: ClassVar[Literal["features", "boxes", "points"]] = "features"
@@ -45,19 +44,19 @@ class FusionMethod(ABC):
 
     @abstractmethod
     def __init__(self, detector: PointPillars) -> None:
-        """Make the method for what this detector sees; the detector is not changed."""
+        """Make the method for the outputs of this detector, which is not changed."""
 
     @abstractmethod
-    def message(self, seen: PerceptionOutput) -> Arrays:
-        """What an agent sends to all others in a frame; {} for nothing. All of it is encoded and counted."""
+    def message(self, observation: PerceptionOutput) -> Arrays:
+        """The message that an agent broadcasts in a frame; {} for none. All of it is encoded and counted."""
 
     @abstractmethod
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
-        """What the ego concludes.
+        """Fuse the ego's observation with the received messages.
 
         Args:
-            ego: what it saw itself.
-            received: from the other agents; maybe none.
+            ego: its own observation.
+            received: messages of the other agents; may be empty.
 
         Returns:
             Boxes with scores in the ego's LiDAR frame, best first.

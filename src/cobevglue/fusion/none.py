@@ -18,7 +18,7 @@ class NoCollaboration(FusionMethod):
     def __init__(self, detector: PointPillars) -> None:
         """The detector has done all there is to do."""
 
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """Nothing."""
         return {}
 

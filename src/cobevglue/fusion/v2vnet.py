@@ -1,4 +1,4 @@
-"""V2VNet (Wang et al., ECCV 2020): agents pass messages to each other, and each updates its map by what it heard."""
+"""V2VNet (Wang et al., ECCV 2020): agents exchange messages, and each updates its map with those received."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class V2VNet(CoarseMapFusion):
 
         Args:
             states: (n, C, H, W) of n agents at first, all in the ego's frame, the ego first.
-            weight: (n, 1, H, W) what messages from each agent are multiplied with.
+            weight: (n, 1, H, W) weight of the messages of each agent.
 
         Returns:
             (C, H, W).
@@ -59,8 +59,8 @@ class V2VNet(CoarseMapFusion):
         for remaining in reversed(range(self.rounds)):
             receivers = states if remaining else states[:1]  # the ego's is the last state that is of use
             sent, own = self.sender(states), self.receiver(receivers)
-            heard = torch.stack([(torch.relu(sent + one) * weight).amax(dim=0) for one in own])
-            states = self.update(receivers, heard)
+            aggregated = torch.stack([(torch.relu(sent + one) * weight).amax(dim=0) for one in own])
+            states = self.update(receivers, aggregated)
         last: Tensor = self.last(states)[0]
         return last
 
@@ -73,9 +73,9 @@ class GatedUpdate(nn.Module):
         self.gates = nn.Conv2d(states + inputs, 2 * states, 1)
         self.candidate = nn.Conv2d(states + inputs, states, 1)
 
-    def forward(self, state: Tensor, heard: Tensor) -> Tensor:
-        """The new state (B, states, H, W): between the old one and a candidate made of it and what was heard."""
-        gates: Tensor = self.gates(torch.cat([state, heard], dim=1)).sigmoid()
+    def forward(self, state: Tensor, message: Tensor) -> Tensor:
+        """The new state (B, states, H, W): between the old one and a candidate made of it and the message."""
+        gates: Tensor = self.gates(torch.cat([state, message], dim=1)).sigmoid()
         change, keep = gates.chunk(2, dim=1)
-        candidate: Tensor = self.candidate(torch.cat([keep * state, heard], dim=1)).tanh()
+        candidate: Tensor = self.candidate(torch.cat([keep * state, message], dim=1)).tanh()
         return state + change * (candidate - state)

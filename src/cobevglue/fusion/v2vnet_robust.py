@@ -90,8 +90,8 @@ class V2VNetRobust(V2VNet):
 
     def loss(self, samples: Sequence[FusionSample], targets: TargetBatch, loss: DetectionLoss) -> dict[str, Tensor]:
         """The detector's loss, that of the corrections ("pose") and that of the messages' weights ("attention")."""
-        agents = [seen for sample in samples for seen in sample.observations]
-        shared = self.share([torch.stack(scale) for scale in zip(*(seen.features for seen in agents), strict=True)])
+        agents = [one for sample in samples for one in sample.observations]
+        shared = self.share([torch.stack(scale) for scale in zip(*(one.features for one in agents), strict=True)])
         counts = [len(sample.observations) for sample in samples]
         maps, own = (torch.split(m, counts) for m in shared)
         parts = [self._sample_loss(maps[number], sample, number) for number, sample in enumerate(samples)]
@@ -121,7 +121,7 @@ class V2VNetRobust(V2VNet):
         return self._fuse_weighted(torch.cat([ego, moved]), covered, logits), pose, attention
 
     def _match(self, first: Tensor, moved: Tensor, covered: Tensor, poses: Sequence[SE2]) -> tuple[Tensor, Tensor]:
-        """What `PoseMatching` says of P maps that were moved by these poses."""
+        """The output of `PoseMatching` for P maps that were warped by these poses."""
         middles = moved.new_tensor(np.reshape([_middle(pose).translation for pose in poses], (-1, 2)))
         motions, logits = self.matching(first, moved, covered, middles)
         return motions, logits
@@ -135,8 +135,8 @@ class V2VNetRobust(V2VNet):
 def apply_correction(pose: SE2, motion: Sequence[float]) -> SE2:
     """A relative pose after a correction from the left (section 3.1 of the paper).
 
-    It turns about the middle between the two agents, where most of what both see is: so a turn and a shift are told
-    apart, and a turn that is slightly wrong does little harm.
+    The rotation is about the midpoint between the two agents, where most common objects are: this separates rotation
+    and translation, and a small error of the rotation does little harm.
 
     Args:
         pose: first_SE2_second.
@@ -154,7 +154,7 @@ def true_correction(pose: SE2, true: SE2) -> FloatArray:
 
 
 def _middle(pose: SE2) -> SE2:
-    """Half way to the other agent, in the axes of the first."""
+    """The midpoint to the other agent, in the axes of the first."""
     return SE2(pose.x / 2.0, pose.y / 2.0)
 
 

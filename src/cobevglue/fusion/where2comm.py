@@ -1,7 +1,7 @@
 """Where2comm (Hu et al., NeurIPS 2022): agents share the cells where they are confident of an object, and no others.
 
-Built is the paper's first round of communication, in which an agent tells all others the same. Later rounds, in which
-it asks for where itself is not confident, need messages in both directions and are not built.
+This is the paper's first round of communication, in which an agent broadcasts one message. Later rounds, in which it
+requests cells where it is not confident, need messages in both directions and are not implemented.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from cobevglue.se2 import SE2
 __all__ = ["ConfidenceAttention", "Where2comm"]
 
 _WAVELENGTHS = (8.0, 24.0, 72.0, 216.0)
-"""By which distances to a sensor are told apart [m]."""
+"""Of the positional encoding of distances to a sensor [m]."""
 _FEWEST = 1e-3
-"""Share of the cells that an agent sends at least in training."""
+"""Minimum share of cells that an agent sends in training."""
 _SMALLEST = 1e-6
-"""Confidence below which there is no difference: its logarithm has to be finite."""
+"""Lower limit of the confidence, so that its logarithm is finite."""
 
 
 class Where2comm(SingleMapFusion):
@@ -42,7 +42,7 @@ class Where2comm(SingleMapFusion):
 
     Attributes:
         threshold: smoothed confidence from which on a cell is sent; 0 sends all. The 0.01 of the authors' code is what
-            a head that was trained with the focal loss says of the road: two thirds of all cells would be sent.
+            a head trained with the focal loss predicts for empty road: two thirds of all cells would be sent.
     """
 
     threshold: float = 0.05
@@ -95,9 +95,9 @@ class Where2comm(SingleMapFusion):
         return [fused]
 
     @torch.inference_mode()
-    def message(self, seen: PerceptionOutput) -> Arrays:
+    def message(self, observation: PerceptionOutput) -> Arrays:
         """The K selected cells: numbers (K,), row by row, uint16 where that suffices; features (K, C) in float16."""
-        shared, _, selected = self.share([m[None] for m in seen.features])
+        shared, _, selected = self.share([m[None] for m in observation.features])
         cells = selected.flatten().nonzero()[:, 0]
         features = shared[0].flatten(1)[:, cells].T
         kind = np.uint16 if selected.numel() <= 1 << 16 else np.uint32
@@ -129,9 +129,9 @@ class ConfidenceAttention(nn.Module):
     """The paper's message fusion: in every cell, attention of the ego to the agents, then an FFN.
 
     An agent's weight is its scaled dot product with the ego's query times its confidence. Distances to the sensors are
-    told to query and key (the paper's sensor positional encoding). One head. Two things are ours, so that the decoder
+    inputs of query and key (the paper's sensor positional encoding). One head. Two things are ours, so that the decoder
     may start as the single agent's: weights are divided by their sum after the multiplication with the confidence, and
-    the FFN adds to what it is given. Then a cell of which nobody else sent anything stays nearly as it is.
+    the FFN is residual. A cell that no other agent sent stays nearly unchanged.
 
     Args:
         channels: C of the maps.
@@ -139,9 +139,9 @@ class ConfidenceAttention(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        told = channels + 2 * len(_WAVELENGTHS)
-        self.query = nn.Conv2d(told, channels, 1)
-        self.key = nn.Conv2d(told, channels, 1, bias=False)  # one would add the same to all scores
+        inputs = channels + 2 * len(_WAVELENGTHS)
+        self.query = nn.Conv2d(inputs, channels, 1)
+        self.key = nn.Conv2d(inputs, channels, 1, bias=False)  # a bias would add the same to all scores
         last = nn.Conv2d(2 * channels, channels, 1)
         nn.init.normal_(last.weight, std=0.001)
         if last.bias is not None:
@@ -154,7 +154,7 @@ class ConfidenceAttention(nn.Module):
         Args:
             features: (n, C, H, W) of n agents, the ego first.
             confidence: (n, 1, H, W) 0 to 1.
-            present: (n, 1, H, W) whether the agent takes part there; the ego everywhere.
+            present: (n, 1, H, W) whether the agent sent the cell; true everywhere for the ego.
             distance: (n, 1, H, W) to the agent's sensor [m].
 
         Returns:
@@ -166,9 +166,9 @@ class ConfidenceAttention(nn.Module):
         return fused[0]
 
     def weights(self, features: Tensor, confidence: Tensor, present: Tensor, distance: Tensor) -> Tensor:
-        """(n, 1, H, W) what each agent counts for in each cell; 1 over all agents. See `forward`."""
-        told = torch.cat([features, _sinusoids(distance)], dim=1)
-        score: Tensor = (self.query(told[:1]) * self.key(told)).sum(dim=1, keepdim=True)
+        """(n, 1, H, W) attention weights of the agents in each cell, which sum to 1. See `forward`."""
+        inputs = torch.cat([features, _sinusoids(distance)], dim=1)
+        score: Tensor = (self.query(inputs[:1]) * self.key(inputs)).sum(dim=1, keepdim=True)
         score = score / math.sqrt(features.shape[1]) + confidence.clamp(min=_SMALLEST).log()
         return score.masked_fill(~present, -torch.inf).softmax(dim=0)
 

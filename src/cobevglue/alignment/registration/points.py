@@ -1,4 +1,4 @@
-"""What a registration baseline is told of another agent's cloud: a sketch of it that fits a budget of bytes."""
+"""Messages of the registration baselines: a subset of another agent's cloud that fits a budget of bytes."""
 
 from __future__ import annotations
 
