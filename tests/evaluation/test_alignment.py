@@ -105,15 +105,7 @@ def test_evaluate_compares_with_the_truth_frame_by_frame() -> None:
     class Fixed:
         """Says the same every time."""
 
-        def align(
-            self,
-            ego: Boxes,
-            other: Boxes,
-            time: float | None = None,
-            *,
-            ego_body: Boxes | None = None,
-            other_body: Boxes | None = None,
-        ) -> Alignment:
+        def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
             return Alignment(SE2(1.0, 0.0, 0.0), np.array([[0, 0], [1, 0]]))
 
         def reset(self) -> None:

@@ -49,18 +49,10 @@ class Alignment:
 class Aligner(Protocol):
     """A source of the relative pose from two agents' boxes. It may remember; one is needed for each collaborator."""
 
-    def align(
-        self,
-        ego: Boxes,
-        other: Boxes,
-        time: float | None = None,
-        *,
-        ego_body: Boxes | None = None,
-        other_body: Boxes | None = None,
-    ) -> Alignment:
+    def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
         """The pose of `other` (its own frame) in `ego`'s frame; `time` [s] defaults to 0.1 s after the last call.
 
-        `ego_body` and `other_body` are one-row boxes of the agents' own vehicles, each in its agent's frame.
+        Where the own vehicle of an agent is known, it is passed as `ego_body` or `other_body` (see `BEVGlue.align`).
         """
         ...
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from cobevglue.alignment.alignment import Aligner, Alignment
+from cobevglue.alignment.own_body import known_bodies
 from cobevglue.boxes import Boxes
 from cobevglue.messages import ObjectMessage, decode, decode_arrays, encode, encode_arrays
 from cobevglue.typing import Float32Array, FloatArray
@@ -135,7 +136,7 @@ class Pairwise(GroupAligner):
             if name != ego:
                 assert other.boxes is not None
                 aligner = self._aligners.setdefault(name, self._make())
-                bodies = {"ego_body": own.body, "other_body": other.body}
+                bodies = known_bodies(own.body, other.body)
                 found[name] = aligner.align(own.boxes, other.boxes, time, **bodies)
         return found
 

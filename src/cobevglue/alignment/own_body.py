@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +11,19 @@ from cobevglue.alignment.alignment import Alignment
 from cobevglue.boxes import Boxes
 from cobevglue.iou import bev_iou
 
-__all__ = ["append_body", "check_bodies"]
+__all__ = ["append_body", "check_bodies", "known_bodies"]
 
 _TRACK_ID = 2**52
 """Track id of the own vehicle: no tracker gets there."""
+
+
+def known_bodies(ego_body: Boxes | None, other_body: Boxes | None) -> dict[str, Any]:
+    """The keyword arguments of `BEVGlue.align` for the own vehicles that are known; {} if none is.
+
+    So aligners that do not use own vehicles need not accept them.
+    """
+    bodies = {"ego_body": ego_body, "other_body": other_body}
+    return {name: body for name, body in bodies.items() if body is not None}
 
 
 def append_body(boxes: Boxes, body: Boxes | None, name: str) -> Boxes:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cobevglue.alignment.alignment import Aligner
+from cobevglue.alignment.own_body import known_bodies
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import SE2
 from cobevglue.typing import IntArray
@@ -126,10 +127,9 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
     for sequence in sequences:
         aligner = make_aligner()
         for frame in sequence.frames:
+            bodies = known_bodies(frame.ego_body, frame.other_body)
             start = time.perf_counter()
-            alignment = aligner.align(
-                frame.ego, frame.other, frame.time, ego_body=frame.ego_body, other_body=frame.other_body
-            )
+            alignment = aligner.align(frame.ego, frame.other, frame.time, **bodies)
             seconds = time.perf_counter() - start
             translation = yaw = landing = math.inf
             if alignment.ego_SE2_other is not None:
