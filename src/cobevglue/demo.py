@@ -1,7 +1,7 @@
-"""The demonstration: cars at a junction see together, the whole system on simulated LiDAR and the shipped weights.
+"""The demonstration: collaborative perception of cars at a junction, with simulated LiDAR and the shipped weights.
 
-Every car looks at the scene once a frame. What they saw is then put together in five ways: not at all, by poses from
-noisy GPS, from GPS under attack, by CoBEVGlue, which gets no position from anywhere, and by the true poses.
+The perception of each car runs once a frame. Its outputs are fused in five ways: not at all, with poses from noisy GPS,
+from GPS under attack, from BEVGlue, which uses no localisation, and with the true poses.
 """
 
 from __future__ import annotations
@@ -61,23 +61,23 @@ ROWS = MappingProxyType(
         "true_pose": "true pose",
     }
 )
-"""What is compared, and how people read it."""
+"""The compared variants, with their titles."""
 
 NOISE = LocalisationNoise(position=2.0, yaw=2.0)
 """Of the noisy GPS: standard deviations [m, degrees], of every car and frame independently."""
 
 _GPS: dict[str, Disturbance] = {"noisy_gps": NOISE, "attacked_gps": SamePlace()}
-"""What is wrong with the poses that a row is given; under attack, everyone else claims the ego's place."""
+"""Disturbances of the claimed poses by row; under attack all other agents claim the ego's pose."""
 
 WEIGHTS, NETWORK, AGENTS = "compact", "junction_test_0", 3
-"""The detector and the road network, a junction that nothing was trained on; how many cars have a LiDAR."""
+"""The detector, the road network (of the test split), and the number of cars with a LiDAR."""
 
 FRAMES, FRAMES_AT_MOST, RATE = 40, 200, 10.0
 MIN_POINTS = 5
-"""Vehicles that fewer points of all LiDARs together lie on do not count: nothing could find them. Those with fewer
-points of the ego's own are hidden from it."""
+"""Vehicles with fewer points of all LiDARs together are not evaluated. Those with fewer points of the ego's own LiDAR
+are hidden from it."""
 SCORE, IOU = 0.3, 0.5
-"""What is drawn and counted as found: detections of at least this score that overlap a vehicle by at least this."""
+"""Minimum score of shown detections, and minimum IoU of true positives."""
 
 _NEAR = 50.0  # what is hidden within this distance concerns the ego [m]
 _MOVING = 1.0  # [m/s]
@@ -86,12 +86,12 @@ _WORKERS_AT_MOST = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Verdict:
-    """What is right and wrong about the boxes of one row in one frame.
+    """True and false positives of one row in one frame.
 
     Attributes:
-        boxes: K detections sure enough to be looked at, in the ego's frame.
-        ghost: (K,) whether there is no vehicle where a box is; nor is there one that does not count.
-        found: (N,) which of the frame's vehicles were found; only those that count can be.
+        boxes: K detections above the score threshold, in the ego frame.
+        ghost: (K,) whether a detection is a false positive.
+        found: (N,) whether each evaluated vehicle of the frame was detected.
     """
 
     boxes: Boxes
@@ -101,22 +101,22 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DemoFrame:
-    """What happened in one frame; poses and boxes are in the ego's LiDAR frame unless said otherwise.
+    """Data and results of one frame; poses and boxes are in the ego's LiDAR frame unless stated otherwise.
 
     Attributes:
         index: 0, 1, 2, …
         time: time stamp [s].
         ego: the name of the agent whose frame it is.
-        reach: where the detector looks, and what counts.
-        world_SE2_ego: where the ego is.
+        reach: the detection and evaluation range.
+        world_SE2_ego: the ego's pose.
         points: the clouds of all agents by name, (N, 4) float32, each in its own LiDAR frame.
-        truth: N vehicles that at least one point of some agent lies on, without the ego.
+        truth: N vehicles with at least one point of any agent, without the ego.
         point_count: (N,) points of all agents on each.
         own_point_count: (N,) those of the ego's.
         speed: (N,) [m/s].
         ego_SE2_others: the true poses of the others.
         tracked: the boxes that each agent detected and tracks, each in its own LiDAR frame.
-        outputs: what the system made of it, by row.
+        outputs: of the system, by row.
     """
 
     index: int
@@ -135,53 +135,53 @@ class DemoFrame:
 
     @property
     def counted(self) -> BoolArray:
-        """(N,) which vehicles should be found."""
+        """(N,) whether each vehicle is evaluated."""
         return inside(self.truth, self.reach) & (self.point_count >= MIN_POINTS)
 
     @property
     def hidden(self) -> BoolArray:
-        """(N,) which of these the ego cannot find by itself."""
+        """(N,) whether each evaluated vehicle is hidden from the ego."""
         return self.counted & (self.own_point_count < MIN_POINTS)
 
     @property
     def hidden_movers(self) -> IntArray:
-        """Rows of hidden vehicles that drive near the ego, the nearest first."""
+        """Rows of hidden moving vehicles near the ego, the nearest first."""
         distance = np.hypot(self.truth.center[:, 0], self.truth.center[:, 1])
         rows = np.flatnonzero(self.hidden & (self.speed > _MOVING) & (distance < _NEAR))
         return rows[np.argsort(distance[rows], kind="stable")]
 
     def detections(self, row: str) -> DetectionFrame:
-        """What is said and what is true, as average precision is made of it."""
+        """Detections and ground truth for average precision."""
         return DetectionFrame(self.outputs[row].boxes, self.truth, self.point_count, f"frame {self.index}")
 
     def verdict(self, row: str) -> Verdict:
-        """What is right and wrong about the boxes of a row."""
+        """True and false positives of a row."""
         scene = prepare(self.detections(row), self.reach, MIN_POINTS)
         objects = match(scene, IOU)
-        sure = scene.score >= SCORE
+        confident = scene.score >= SCORE
         found = np.zeros(len(self.truth), dtype=np.bool_)
-        found[objects[sure & (objects >= 0)]] = True
-        shown = sure & (objects != DROPPED)
+        found[objects[confident & (objects >= 0)]] = True
+        shown = confident & (objects != DROPPED)
         return Verdict(scene.detections[shown], objects[shown] == FALSE, found)
 
     def used_poses(self, row: str) -> dict[str, SE2]:
-        """Where a row has the other agents; those whose alignment was refused are left out."""
+        """The poses of the other agents that a row used; refused ones are left out."""
         found = self.outputs[row].alignments
         return {name: a.ego_SE2_other for name, a in found.items() if a.ego_SE2_other is not None}
 
     def pose_errors(self, row: str) -> list[tuple[float, float]]:
-        """How far the poses that were used are off [m, rad]."""
+        """Errors of the used poses [m, rad]."""
         return [pose.error_to(self.ego_SE2_others[name]) for name, pose in self.used_poses(row).items()]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DemoResult:
-    """The whole drive.
+    """The whole sequence.
 
     Attributes:
         seed: of the scene.
         roads: the network, in the world's frame.
-        frames: what happened, frame by frame.
+        frames: results by frame.
     """
 
     seed: int
@@ -189,14 +189,14 @@ class DemoResult:
     frames: tuple[DemoFrame, ...]
 
     def story(self) -> DemoFrame:
-        """The frame to show: the first of those in which most vehicles drive near the ego and are hidden from it.
+        """The frame to show: the first with the most hidden moving vehicles near the ego.
 
-        It is chosen by what is there, not by what was found.
+        It is chosen by the ground truth, not by the detections.
         """
         return max(self.frames, key=lambda frame: len(frame.hidden_movers))
 
     def summary(self) -> dict[str, Any]:
-        """The numbers of the drive, ready for JSON; units are in the names, numbers of things are means per frame."""
+        """Metrics of the sequence for JSON; units are in the names, counts are means per frame."""
         return {
             "seed": self.seed,
             "ego": self.frames[0].ego,

@@ -58,7 +58,7 @@ def test_json_has_every_table_and_nothing_else(tiny: Path, tmp_path: Path, capsy
 
 def test_a_second_data_set_stands_beside(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for agent in (1, 2):
-        write_agent(tmp_path / "real" / "test_culvercity" / "drive", agent, range(1))
+        write_agent(tmp_path / "real" / "test_culvercity" / "sequence", agent, range(1))
     real = ("--real", str(tmp_path / "real"), "--tables", "communication", "--frames", "1", "--json")
     assert reproduce(tiny, tmp_path / "out", *real) == 0
     tables = json.loads(capsys.readouterr().out)["tables"]
@@ -75,7 +75,7 @@ def test_a_second_data_set_stands_beside(tiny: Path, tmp_path: Path, capsys: pyt
         (("--split", "tset"), "no split 'tset'; did you mean 'test'"),
         (("--root", "/nowhere"), "no folder /nowhere"),
         (("--detector", "compakt"), "no pretrained detector 'compakt'; did you mean 'compact'"),
-        (("--dataset", "simulated"), "simulated drives have no root"),
+        (("--dataset", "simulated"), "simulated sequences have no root"),
         (("--dataset", "dair-v2x"), "looked for"),
         (("--frames", "0"), "--frames"),
         (("--real", "/nowhere"), "no folder /nowhere"),
@@ -131,4 +131,4 @@ def test_the_recorded_command_repeats_repeated_options() -> None:
 def test_reader_options_are_refused_for_simulated_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reproduce", "--out", str(tmp_path), "--dataset-option", "labels=original"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "have no effect on simulated drives: {'labels': 'original'}" in line
+    assert "have no effect on simulated sequences: {'labels': 'original'}" in line

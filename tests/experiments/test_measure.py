@@ -10,7 +10,7 @@ import pytest
 from cobevglue.boxes import Boxes
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results, pose_quality
-from cobevglue.experiments.results import ConditionResult, FrameResult, FrameTruth, Heard, ScenarioResult
+from cobevglue.experiments.results import ConditionResult, FrameResult, FrameTruth, ReceivedPose, ScenarioResult
 
 CONDITION = Condition(fusion="late", aligner="given")
 RANGE = (-50.0, 50.0, -30.0, 30.0)
@@ -23,14 +23,14 @@ def cars(*x: float, score: float | None = None) -> Boxes:
     return Boxes(np.column_stack([x, np.zeros(n), np.zeros(n)]), np.tile((4.0, 2.0, 1.5), (n, 1)), np.zeros(n), scores)
 
 
-def heard(agent: str, error: float, degrees: float, payload: int = 1000, alignment: int = 100) -> Heard:
+def heard(agent: str, error: float, degrees: float, payload: int = 1000, alignment: int = 100) -> ReceivedPose:
     reason = "" if math.isfinite(error) else "doubtful"
     sent = {"features": payload, "boxes": alignment}
-    return Heard(agent, error, math.radians(degrees), error, reason, sent, alignment)
+    return ReceivedPose(agent, error, math.radians(degrees), error, reason, sent, alignment)
 
 
-def results(*frames: tuple[Boxes, Boxes, tuple[Heard, ...]], points: int = 9, **kept: int) -> Results:
-    """One drive: truth, detections and collaborators of each frame; everyone sees 3 objects together with the ego."""
+def results(*frames: tuple[Boxes, Boxes, tuple[ReceivedPose, ...]], points: int = 9, **kept: int) -> Results:
+    """One sequence: truth, detections and collaborators of each frame; all have 3 objects in common with the ego."""
     truth = [
         FrameTruth(f"{i}", true, np.full(len(true), points), {h.agent: 3 for h in who}, {"head": 0.02 * (1 + len(who))})
         for i, (true, _, who) in enumerate(frames)
@@ -81,7 +81,7 @@ def test_times_are_medians_per_cloud() -> None:
 
 
 def test_what_was_left_out_is_added_up() -> None:
-    one = results((cars(0), cars(score=0.5), ()), without=2).drives[0]
+    one = results((cars(0), cars(score=0.5), ()), without=2).sequences[0]
     assert Results([one, one], RANGE, 5).left_out == {"without": 4}
     assert Results([one, one], RANGE, 5).frame_count == 2
 

@@ -14,7 +14,7 @@ from cobevglue.experiments.results import (
     ConditionResult,
     FrameResult,
     FrameTruth,
-    Heard,
+    ReceivedPose,
     ScenarioResult,
     read_result,
     write_result,
@@ -25,8 +25,8 @@ pytest.importorskip("torch")
 CONDITION = Condition(
     fusion="cobevglue", aligner="bevglue", disturbance="noise", disturbance_options={"position": 0.5, "yaw": 0.5}
 )
-HEARD = Heard("car2", 0.25, 0.01, 0.5, "", {"boxes": 240, "features": 2_816_067}, 240)
-REFUSED = Heard("car3", math.inf, math.inf, math.inf, "too few common objects", {"boxes": 0, "features": 7}, 0)
+HEARD = ReceivedPose("car2", 0.25, 0.01, 0.5, "", {"boxes": 240, "features": 2_816_067}, 240)
+REFUSED = ReceivedPose("car3", math.inf, math.inf, math.inf, "too few common objects", {"boxes": 0, "features": 7}, 0)
 
 
 def boxes(count: int, shift: float = 0.0) -> Boxes:
@@ -45,7 +45,7 @@ def result() -> ScenarioResult:
     frames = {0: FrameResult(boxes(2), (HEARD, REFUSED), {"fusion": 0.5}), 1: FrameResult(boxes(0), (), {})}
     other = CONDITION.model_copy(update={"fusion": "late", "every": 2})
     return ScenarioResult(
-        "drive one",
+        "sequence one",
         "car1",
         truth,
         {"agents without a cloud": 3},
@@ -99,7 +99,7 @@ def test_damaged_or_foreign_file_is_named(tmp_path: Path, damage: str) -> None:
         path.write_text("no result")
     else:
         np.savez(path, boxes=np.zeros(3))
-    with pytest.raises(ValueError, match=r"one\.npz: damaged, or no result of a drive"):
+    with pytest.raises(ValueError, match=r"one\.npz: damaged, or no result of a sequence"):
         read_result(path)
 
 

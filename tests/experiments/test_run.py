@@ -1,4 +1,4 @@
-"""One drive under many conditions: who takes part, what is the truth, and what depends on what."""
+"""One sequence under many conditions: who takes part, what is the truth, and what depends on what."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from cobevglue.disturbance import LocalisationNoise
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.results import ConditionResult, ScenarioResult
-from cobevglue.experiments.run import MessageMemo, run_drive
-from cobevglue.experiments.study import StudySettings, open_drive
+from cobevglue.experiments.run import MessageMemo, run_sequence
+from cobevglue.experiments.study import StudySettings, open_sequence
 from cobevglue.fusion.late import LateFusion
 from cobevglue.messages import Arrays
 from cobevglue.perception import PerceptionOutput, PointPillars
@@ -29,7 +29,7 @@ OURS = Condition(fusion="cobevglue", aligner="bevglue")
 
 
 def run(settings: StudySettings, conditions: list[Condition], number: int = 0) -> ScenarioResult:
-    return run_drive(settings, open_drive(settings, number), number, conditions, Models(settings))
+    return run_sequence(settings, open_sequence(settings, number), number, conditions, Models(settings))
 
 
 def numbers(result: ConditionResult) -> list[list[list[float]]]:
@@ -71,9 +71,9 @@ def test_pose_errors_are_those_of_the_noise(settings: StudySettings) -> None:
     noise = LocalisationNoise(position=2.5, yaw=2.5)
     from cobevglue.experiments.observed_sequence import ObservedSequence
 
-    drive = ObservedSequence(Models(settings).detector)
-    drive.observe(open_drive(settings, 0))
-    claimed = noise.apply(drive.frames, 1, "1", (settings.seed, 0)).claimed
+    sequence = ObservedSequence(Models(settings).detector)
+    sequence.observe(open_sequence(settings, 0))
+    claimed = noise.apply(sequence.frames, 1, "1", (settings.seed, 0)).claimed
     believed = SE2.from_matrix(np.linalg.inv(claimed["1"]) @ claimed["2"])
     true = SE2.from_matrix(np.linalg.inv(world_SE3_lidar(1, 1)) @ world_SE3_lidar(2, 1))
     (heard,) = result.conditions[noisy.key].frames[1].heard
@@ -100,7 +100,7 @@ def test_late_agent_takes_part_from_arrival(settings: StudySettings) -> None:
 
 
 def test_agents_come_and_go_and_egoless_frames_drop(tiny: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "data" / "test" / "drive"
+    folder = tmp_path / "data" / "test" / "sequence"
     write_agent(folder, 1, range(3))
     write_agent(folder, 1, range(4, 5))
     write_agent(folder, 2, range(2))
@@ -114,13 +114,13 @@ def test_agents_come_and_go_and_egoless_frames_drop(tiny: Path, tmp_path: Path) 
 
 
 def test_a_roadside_unit_is_never_the_ego(tiny: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "data" / "test" / "drive"
+    folder = tmp_path / "data" / "test" / "sequence"
     write_agent(folder, 1, range(2), name="-1")
     write_agent(folder, 2, range(2), name="7")
     result = run(tiny_settings(tiny, dataset="v2xset", root=str(tmp_path / "data")), [CLEAN])
     assert result.ego == "7"
     assert result.conditions[CLEAN.key].frames[0].heard[0].agent == "-1"
-    alone = tmp_path / "alone" / "test" / "drive"
+    alone = tmp_path / "alone" / "test" / "sequence"
     write_agent(alone, 1, range(2), name="-1")
     nobody = run(tiny_settings(tiny, dataset="v2xset", root=str(tmp_path / "alone")), [CLEAN])
     assert (nobody.ego, nobody.truth) == ("", [])
@@ -128,7 +128,7 @@ def test_a_roadside_unit_is_never_the_ego(tiny: Path, tmp_path: Path) -> None:
 
 
 def test_one_agent_alone_sees_what_it_sees(tiny: Path, tmp_path: Path) -> None:
-    write_agent(tmp_path / "data" / "test" / "drive", 1, range(2))
+    write_agent(tmp_path / "data" / "test" / "sequence", 1, range(2))
     result = run(tiny_settings(tiny, root=str(tmp_path / "data")), [ALONE, OURS, CLEAN])
     alone, ours, clean = (numbers(one) for one in result.conditions.values())
     assert alone == ours == clean
@@ -137,7 +137,7 @@ def test_one_agent_alone_sees_what_it_sees(tiny: Path, tmp_path: Path) -> None:
 
 def test_a_frame_without_objects_is_a_frame(tiny: Path, tmp_path: Path) -> None:
     for agent in (1, 2):
-        write_agent(tmp_path / "data" / "test" / "drive", agent, range(2), cars=CARS[:0])
+        write_agent(tmp_path / "data" / "test" / "sequence", agent, range(2), cars=CARS[:0])
     result = run(tiny_settings(tiny, root=str(tmp_path / "data")), [OURS, CLEAN])
     assert [len(truth.objects) for truth in result.truth] == [0, 0]
     assert [truth.co_visible for truth in result.truth] == [{"2": 0}] * 2
@@ -153,7 +153,7 @@ def test_conditions_can_be_run_on_some_frames_only(settings: StudySettings) -> N
 
 def test_long_sequence_is_independent_of_blocks(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for agent in (1, 2):
-        write_agent(tmp_path / "data" / "test" / "drive", agent, range(9))
+        write_agent(tmp_path / "data" / "test" / "sequence", agent, range(9))
     settings = tiny_settings(tiny, root=str(tmp_path / "data"))
     late = Condition(fusion="late", aligner="given", disturbance="delay", disturbance_options={"seconds": 0.3})
     old = Condition(fusion="late", aligner="given", disturbance="replay", disturbance_options={"seconds": 0.5})
@@ -171,7 +171,7 @@ def test_work_is_reported_as_it_is_estimated(settings: StudySettings) -> None:
 
     conditions = [CLEAN, OURS, ALONE.model_copy(update={"every": 3})]
     done: list[float] = []
-    run_drive(settings, open_drive(settings, 0), 0, conditions, Models(settings), done.append)
+    run_sequence(settings, open_sequence(settings, 0), 0, conditions, Models(settings), done.append)
     assert sum(done) == pytest.approx(_work_of([_Job(settings, 0, tuple(conditions))]))
 
 
@@ -186,9 +186,9 @@ def test_a_message_is_made_once_for_a_view(settings: StudySettings) -> None:
     models = Models(settings)
     from cobevglue.experiments.observed_sequence import ObservedSequence
 
-    drive = ObservedSequence(models.detector)
-    drive.observe(open_drive(settings, 0))
-    first, second = (frame.observations["2"] for frame in drive.frames[:2])
+    sequence = ObservedSequence(models.detector)
+    sequence.observe(open_sequence(settings, 0))
+    first, second = (frame.observations["2"] for frame in sequence.frames[:2])
     method = Counting(models.detector)
     memo = MessageMemo(method)
     assert memo.kind == "boxes"
@@ -251,7 +251,7 @@ def test_frames_without_label_files_are_skipped_and_counted(settings: StudySetti
     def missing() -> tuple[np.ndarray, Boxes]:
         raise FileNotFoundError("calibration.json is not there")
 
-    first, second, *_ = open_drive(settings, 0)
+    first, second, *_ = open_sequence(settings, 0)
     points = second.agents["2"].points
     broken = replace(second, agents={**second.agents, "2": AgentFrame(missing, lambda: points)})
     sequence = ObservedSequence(Models(settings).detector)

@@ -27,9 +27,9 @@ CONDITIONS = [
 def numbers(results: list[ScenarioResult]) -> list[object]:
     """Everything but the times."""
     return [
-        (drive.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.heard)
-        for drive in results
-        for key, run in sorted(drive.conditions.items())
+        (sequence.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.heard)
+        for sequence in results
+        for key, run in sorted(sequence.conditions.items())
         for index, frame in run.frames.items()
     ]
 
@@ -45,10 +45,10 @@ def whole(settings: StudySettings, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_every_drive_is_run_under_every_condition_once(whole: list[ScenarioResult]) -> None:
-    assert [drive.scenario for drive in whole] == ["a_pair", "b_three"]
-    for drive in whole:
-        assert list(drive.conditions) == [condition.key for condition in CONDITIONS]
-        assert all(list(run.frames) == [0, 1, 2] for run in drive.conditions.values())
+    assert [sequence.scenario for sequence in whole] == ["a_pair", "b_three"]
+    for sequence in whole:
+        assert list(sequence.conditions) == [condition.key for condition in CONDITIONS]
+        assert all(list(run.frames) == [0, 1, 2] for run in sequence.conditions.values())
 
 
 def test_an_interrupted_run_goes_on(settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_finished_conditions_are_not_run_again(settings: StudySettings, tmp_path
     assert run_study(settings, CONDITIONS[:2], tmp_path, progress=lambda *now: progress.extend(now))
     assert not progress
     more = run_study(settings, CONDITIONS[1:], tmp_path, progress=lambda *now: progress.extend(now))
-    assert max(progress) == 2 * 3 * (10 + 1)  # two drives of three frames: perception, and the condition that is new
+    assert max(progress) == 2 * 3 * (10 + 1)  # two sequences of three frames: perception, and the condition that is new
     assert list(more[0].conditions) == [condition.key for condition in CONDITIONS[1:]]
     progress.clear()
     run_study(settings, CONDITIONS, tmp_path, progress=lambda *now: progress.extend(now))
@@ -107,12 +107,12 @@ def test_only_what_has_other_weights_is_run_anew(tmp_path: Path) -> None:
     method = FCooper(detector)
     method.save(tmp_path / "weights" / "f-cooper.safetensors")
     settings = tiny_settings(tmp_path, scenarios=1, untrained=False, weights=str(tmp_path / "weights"))
-    before = run_study(settings, CONDITIONS, tmp_path / "drives")
+    before = run_study(settings, CONDITIONS, tmp_path / "sequences")
     for parameter in method.head.parameters():
         parameter.data += 0.1
     method.save(tmp_path / "weights" / "f-cooper.safetensors")
     progress: list[float] = []
-    after = run_study(settings, CONDITIONS, tmp_path / "drives", progress=lambda *now: progress.extend(now))
+    after = run_study(settings, CONDITIONS, tmp_path / "sequences", progress=lambda *now: progress.extend(now))
     assert max(progress) == 2 * (10 + 1)  # two frames: perception, and the one condition of that method
     key = CONDITIONS[2].key
     assert numbers([before[0]])[0] == numbers([after[0]])[0]
@@ -122,13 +122,13 @@ def test_only_what_has_other_weights_is_run_anew(tmp_path: Path) -> None:
 def test_other_detector_of_same_name_restarts_study(tmp_path: Path) -> None:
     tiny_tree(tmp_path / "data", frames=1)
     file = tiny_detector(tmp_path)
-    run_study(tiny_settings(tmp_path), CONDITIONS, tmp_path / "drives")
+    run_study(tiny_settings(tmp_path), CONDITIONS, tmp_path / "sequences")
     detector = PointPillars.load(file)
     for parameter in detector.parameters():
         parameter.data += 0.01
     detector.save(file)
     with pytest.raises(ValueError, match=r"another study.*detector_weights"):
-        run_study(tiny_settings(tmp_path), CONDITIONS, tmp_path / "drives")
+        run_study(tiny_settings(tmp_path), CONDITIONS, tmp_path / "sequences")
 
 
 def test_damaged_files_are_named(settings: StudySettings, tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_what_goes_wrong_in_a_process_is_said(tiny: Path, tmp_path: Path) -> Non
     (tmp_path / "data" / "test" / "b_three" / "2" / "000002.yaml").write_text("nothing: 1")
     settings = tiny_settings(tiny, root=str(tmp_path / "data"))
     with pytest.raises(ValueError, match=r"000002\.yaml: no"):
-        run_study(settings, CONDITIONS[:1], tmp_path / "drives", workers=2)
+        run_study(settings, CONDITIONS[:1], tmp_path / "sequences", workers=2)
 
 
 def test_a_local_ray_cluster_gives_the_same(
@@ -175,7 +175,7 @@ def test_a_local_ray_cluster_gives_the_same(
     [
         ({"dataset": "opv2w"}, ValueError, "no data set 'opv2w'; did you mean 'opv2v'"),
         ({"dataset": "opv2v", "root": None}, ValueError, "the data set opv2v needs a root"),
-        ({"dataset": "simulated"}, ValueError, "simulated drives have no root"),
+        ({"dataset": "simulated"}, ValueError, "simulated sequences have no root"),
         ({"split": "tset"}, ValueError, "no split 'tset'; did you mean 'test'"),
         ({"root": "/nowhere"}, FileNotFoundError, "no folder /nowhere"),
         ({"detector": "compakt"}, ValueError, "no pretrained detector 'compakt'; did you mean 'compact'"),
@@ -187,8 +187,8 @@ def test_bad_settings_are_refused_before_anything_is_run(
     settings: StudySettings, tmp_path: Path, values: dict[str, object], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        run_study(settings.model_copy(update=values), CONDITIONS, tmp_path / "drives")
-    assert not (tmp_path / "drives").exists()
+        run_study(settings.model_copy(update=values), CONDITIONS, tmp_path / "sequences")
+    assert not (tmp_path / "sequences").exists()
 
 
 def test_the_study_is_on_record(settings: StudySettings, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A detector that is made in no time and drives that are gone through in no time, in OPV2V's format."""
+"""A detector that is made in no time and sequences that are gone through in no time, in OPV2V's format."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def write_agent(
 
 
 def tiny_tree(root: Path, frames: int = 3) -> Path:
-    """A data set with the split "test": a drive of two agents, and one with three, of whom one comes late."""
+    """A data set with the split "test": a sequence of two agents, and one with three, of whom one comes late."""
     for agent in (1, 2):
         write_agent(root / "test" / "a_pair", agent, range(frames))
     for agent in (1, 2):

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 __all__ = ["reproduce"]
 
 _PACKAGES = ("cobevglue", "torch", "numpy", "scipy", "numba", "libsumo", "open3d-cpu", "small-gicp", "ray")
-_QUICK_DRIVES, _QUICK_FRAMES = 2, 6
+_QUICK_SEQUENCES, _QUICK_FRAMES = 2, 6
 _REAL_SPLIT = "test_culvercity"
 
 
 def reproduce(
     context: typer.Context,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Minutes instead of an hour: few drives, frames and conditions.")
+        bool, typer.Option("--quick", help="Minutes instead of an hour: few sequences, frames and conditions.")
     ] = False,
     dataset: Annotated[str, typer.Option(help="simulated, opv2v, v2xset, v2v4real or dair-v2x.")] = "simulated",
     root: Annotated[Path | None, typer.Option(help="Root of the data set; none for simulated.")] = None,
@@ -53,12 +53,12 @@ def reproduce(
         str | None, typer.Option(help="Only these fusion methods, with commas, beside none and cobevglue.")
     ] = None,
     scenarios: Annotated[
-        int | None, typer.Option(min=1, help="So many drives at most; 20 of simulated ones if left out.")
+        int | None, typer.Option(min=1, help="So many sequences at most; 20 of simulated ones if left out.")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="So many frames of each drive; 20 of simulated ones if left out.")
+        int | None, typer.Option(min=1, help="So many frames of each sequence; 20 of simulated ones if left out.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of simulated drives and all that goes wrong.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of simulated sequences and all that goes wrong.")] = None,
     detector: Annotated[str, typer.Option(help="A shipped model's name, or a .safetensors file.")] = "compact",
     weights: Annotated[
         Path | None, typer.Option(help="Folder with weights of the fusion methods, NAME.safetensors.")
@@ -74,7 +74,7 @@ def reproduce(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Reproduce the paper's tables and figures, on simulated drives or on a data set of yours.
+    """Reproduce the paper's tables and figures, on simulated sequences or on a data set of yours.
 
     Every fusion method under localisation noise and attack, registration of points, ablation, other disturbances,
     quality of poses, communication and time. Writes index.html, report.md and CSV files; with a data set of the paper,
@@ -94,7 +94,7 @@ def reproduce(
     options = parse_dataset_options(dataset_option)
     names = list(EXPERIMENTS) if tables is None else [name.strip() for name in tables.split(",")]
     common: dict[str, Any] = {
-        "scenarios": scenarios or (_QUICK_DRIVES if quick else None),
+        "scenarios": scenarios or (_QUICK_SEQUENCES if quick else None),
         "frames": frames or (_QUICK_FRAMES if quick else None),
         "seed": SEED if seed is None else seed,
         "detector": detector,
@@ -105,7 +105,7 @@ def reproduce(
         StudySettings(dataset=dataset, root=None if root is None else str(root), split=split, reader=options, **common)
     ]
     if real is not None:
-        # Not all of its drives have clouds: those without are no reason to look at fewer.
+        # Not all of its sequences have clouds: those without are no reason to look at fewer.
         studies.append(
             StudySettings(dataset="opv2v", root=str(real), split=_REAL_SPLIT, **{**common, "scenarios": None})
         )

@@ -1,8 +1,8 @@
-"""Which detection of a frame found which object, and what was missed or made up.
+"""Matching of detections and ground-truth objects: true positives, false positives, missed objects.
 
-*Counted*: an object of the truth that lies in the evaluation range (its centre; the borders belong to it) and has at
-least `min_points` points. All others are *ignored*: nobody has to find them, and finding them is no mistake. With
-`min_points=0` an object that no point hit counts as well. Detections whose centre is outside the range do not exist.
+*Evaluated* (`counted`): an object whose centre is in the evaluation range (borders included) and that has at least
+`min_points` points. All others are *ignored*: detecting them is neither required nor an error. With `min_points=0`
+objects without points are evaluated, too. Detections whose centre is outside the range are discarded.
 
 *Matching*, one IoU threshold at a time: in falling order of score (equal scores in order of their rows), each detection
 takes the counted object it overlaps most among those not yet taken. It is *true* if that overlap (bird's-eye-view IoU)
@@ -38,16 +38,16 @@ EvaluationRange = tuple[float, float, float, float]
 """x_min, x_max, y_min, y_max in the agent's LiDAR frame [m]."""
 
 FALSE, DROPPED = -1, -2
-"""In the place of a row of the truth: the detection found nothing, or does not count."""
+"""In place of a row of the ground truth: a false positive, or a dropped detection."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DetectionFrame:
-    """What one agent detected at one time, and the truth about it; all in the agent's LiDAR frame.
+    """The detections and ground truth of one agent in one frame, in the agent's LiDAR frame.
 
     Attributes:
         detections: N boxes with scores.
-        truth: K boxes; labels, where there are any, are reported apart.
+        truth: K boxes; results are also reported by label, where there are labels.
         point_count: (K,) how many points of the cloud lie in each object, or None where this is not known.
         name: of the frame, for lists of failures and error messages.
         agent: whose frame it is, for the same.
@@ -65,7 +65,7 @@ class DetectionFrame:
     detection_point_count: IntArray | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not fit together."""
+        """Check scores and counts."""
         if self.detections.score is None and len(self.detections):
             raise ValueError(f"{self._where}detections: score: average precision needs scores, got None")
         for field, counts, boxes in (
@@ -82,15 +82,15 @@ class DetectionFrame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scene:
-    """A frame made ready for matching.
+    """A frame prepared for matching.
 
     Attributes:
         detections: N boxes inside the range, best score first, equal scores in their order of before.
         rows: (N,) their rows in the frame's detections.
         score: (N,) their scores.
         truth: K boxes.
-        counted: (K,) which of them count.
-        iou: (N, K) overlap seen from above.
+        counted: (K,) whether each is evaluated.
+        iou: (N, K) bird's-eye-view IoU.
     """
 
     detections: Boxes
@@ -102,7 +102,7 @@ class Scene:
 
 
 def prepare(frame: DetectionFrame, evaluation_range: EvaluationRange | None = None, min_points: int = 0) -> Scene:
-    """Sort the detections, leave out those outside the range, and say which objects count.
+    """Sort the detections, discard those outside the range, and determine the evaluated objects.
 
     Args:
         frame: the frame.

@@ -1,4 +1,4 @@
-"""One way to run the system over the drives of a study: a fusion method, a source of poses, and what goes wrong."""
+"""One way to run the system over the sequences of a study: a fusion method, a source of poses, and what goes wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers from the results of a study: average precision, poses, bytes, times of a condition over all drives."""
+"""Metrics of a study: average precision, poses, bytes and times of a condition over all sequences."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from cobevglue.evaluation.detection import evaluate_detections
 from cobevglue.evaluation.detection_matching import DetectionFrame, EvaluationRange, inside
 from cobevglue.experiments.condition import Condition
-from cobevglue.experiments.results import FrameResult, FrameTruth, Heard, ScenarioResult
+from cobevglue.experiments.results import FrameResult, FrameTruth, ReceivedPose, ScenarioResult
 
 __all__ = ["IOUS", "PoseQuality", "Results", "pose_quality"]
 
 IOUS = (0.3, 0.5, 0.7)
-"""Overlaps from which a detection is true."""
+"""IoU thresholds of true positives."""
 
 
 @dataclass(eq=False)
@@ -25,30 +25,30 @@ class Results:
     """The results of a study.
 
     Attributes:
-        drives: of each drive.
-        evaluation_range: x_min, x_max, y_min, y_max [m] of what counts.
+        sequences: results of each sequence.
+        evaluation_range: x_min, x_max, y_min, y_max [m] of evaluated objects.
         min_points: objects with fewer points are ignored.
     """
 
-    drives: Sequence[ScenarioResult]
+    sequences: Sequence[ScenarioResult]
     evaluation_range: EvaluationRange
     min_points: int
     _precision: dict[tuple[str, int], dict[float, float]] = field(default_factory=dict)
 
     def has(self, condition: Condition) -> bool:
         """Whether the condition was run."""
-        return all(condition.key in drive.conditions for drive in self.drives)
+        return all(condition.key in sequence.conditions for sequence in self.sequences)
 
     def ap(self, condition: Condition, iou: float, every: int = 1) -> float:
-        """Average precision, in [0, 1]; NaN where no object counts.
+        """Average precision, in [0, 1]; NaN without evaluated objects.
 
         Args:
             condition: one that was run.
             iou: one of `IOUS`.
-            every: look at every so many frames only; a multiple of what the condition was run on.
+            every: use every n-th frame only; a multiple of the condition's own interval.
         """
-        asked = condition.key, every
-        if asked not in self._precision:
+        key = condition.key, every
+        if key not in self._precision:
             report = evaluate_detections(
                 (
                     DetectionFrame(frame.boxes, truth.objects, truth.point_count, truth.timestamp)
@@ -59,28 +59,28 @@ class Results:
                 self.min_points,
                 range_bins=(),
             )
-            self._precision[asked] = {one: report.ap(one) for one in IOUS}
-        return self._precision[asked][iou]
+            self._precision[key] = {one: report.ap(one) for one in IOUS}
+        return self._precision[key][iou]
 
     def frames(self, condition: Condition, every: int = 1) -> Iterator[tuple[FrameTruth, FrameResult]]:
-        """The frames that were run, of all drives in order, with their truth."""
-        for drive in self.drives:
-            for index, frame in drive.conditions[condition.key].frames.items():
+        """The evaluated frames of all sequences in order, with their ground truth."""
+        for sequence in self.sequences:
+            for index, frame in sequence.conditions[condition.key].frames.items():
                 if index % every == 0:
-                    yield drive.truth[index], frame
+                    yield sequence.truth[index], frame
 
-    def heard(self, condition: Condition, every: int = 1) -> Iterator[tuple[int, Heard]]:
-        """Every collaborator in every frame, behind the number of objects that both it and the ego detected."""
+    def heard(self, condition: Condition, every: int = 1) -> Iterator[tuple[int, ReceivedPose]]:
+        """(number of objects detected by both, collaborator) for every collaborator in every frame."""
         for truth, frame in self.frames(condition, every):
             for one in frame.heard:
                 yield truth.co_visible.get(one.agent, 0), one
 
     def payload_bytes(self, condition: Condition) -> float:
-        """What a collaborator sends for fusion in a frame, mean; NaN without any."""
+        """Mean bytes that a collaborator sends for fusion in a frame; NaN without any."""
         return _mean([sum(one.message_bytes.values()) - one.alignment_bytes for _, one in self.heard(condition)])
 
     def alignment_bytes(self, condition: Condition, every: int = 1) -> float:
-        """What a collaborator sends for alignment in a frame, mean; NaN without any."""
+        """Mean bytes that a collaborator sends for alignment in a frame; NaN without any."""
         return _mean([one.alignment_bytes for _, one in self.heard(condition, every)])
 
     def milliseconds(self, condition: Condition) -> dict[str, float]:
@@ -92,36 +92,36 @@ class Results:
         """Median time of each stage of perception for one cloud [ms]."""
         frames = [
             {stage: seconds / (1 + len(truth.co_visible)) for stage, seconds in truth.seconds.items()}
-            for drive in self.drives
-            for truth in drive.truth
+            for sequence in self.sequences
+            for truth in sequence.truth
         ]
         return {stage: 1e3 * float(np.median([one[stage] for one in frames])) for stage in (frames or [{}])[0]}
 
     @property
     def frame_count(self) -> int:
-        """Frames that were used."""
-        return sum(len(drive.truth) for drive in self.drives)
+        """Number of evaluated frames."""
+        return sum(len(sequence.truth) for sequence in self.sequences)
 
     @property
     def lonely_frames(self) -> int:
         """Frames without any collaborator."""
-        return sum(not truth.co_visible for drive in self.drives for truth in drive.truth)
+        return sum(not truth.co_visible for sequence in self.sequences for truth in sequence.truth)
 
     @property
     def left_out(self) -> Counter[str]:
-        """What was not used, and how often."""
+        """Reasons for skipped data, with counts."""
         total: Counter[str] = Counter()
-        for drive in self.drives:
-            total.update(drive.left_out)
+        for sequence in self.sequences:
+            total.update(sequence.left_out)
         return total
 
     @property
     def object_count(self) -> int:
-        """Objects that count, in all frames."""
+        """Number of evaluated objects in all frames."""
         return sum(
             int((inside(truth.objects, self.evaluation_range) & (truth.point_count >= self.min_points)).sum())
-            for drive in self.drives
-            for truth in drive.truth
+            for sequence in self.sequences
+            for truth in sequence.truth
         )
 
 
@@ -130,7 +130,7 @@ class PoseQuality:
     """Shares of all collaborators in all frames; NaN where there are none to divide by.
 
     Attributes:
-        count: how many.
+        count: number of collaborators.
         refused: share without a pose.
         success_1, success_2, success_3: share with a pose within k m and k degrees.
         wrong: share of the accepted ones that are off by more than 3 m or 3 degrees.
@@ -148,8 +148,8 @@ class PoseQuality:
     yaw: float
 
 
-def pose_quality(heard: Sequence[Heard]) -> PoseQuality:
-    """How good the poses of these collaborators are."""
+def pose_quality(heard: Sequence[ReceivedPose]) -> PoseQuality:
+    """Success rates and errors of these collaborators' poses."""
     accepted = [one for one in heard if one.accepted]
     return PoseQuality(
         count=len(heard),

@@ -78,7 +78,7 @@ def _data(part: Part) -> list[str]:
     results, settings = part.results, part.settings
     x_min, x_max, y_min, y_max = results.evaluation_range
     counts = (
-        f"{settings.label}: {results.frame_count} frames of {len(results.drives)} drives, "
+        f"{settings.label}: {results.frame_count} frames of {len(results.sequences)} sequences, "
         f"{results.object_count} objects that count: with {settings.min_points} points or more of all agents together, "
         f"within x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} m of the ego's LiDAR. All detections are sorted "
         "by score together (global AP)."

@@ -10,7 +10,7 @@ from cobevglue.experiments.models import Models
 from cobevglue.experiments.pictures import Picture, noise_pictures, registration_pictures, scene_pictures
 from cobevglue.experiments.report import Part, write_report
 from cobevglue.experiments.runner import run_study
-from cobevglue.experiments.study import StudySettings, drive_names
+from cobevglue.experiments.study import StudySettings, sequence_names
 from cobevglue.experiments.table import Table
 from cobevglue.experiments.tables import Experiment, Scope, conditions_of
 
@@ -34,7 +34,7 @@ def reproduce(
         studies: the data sets and networks.
         experiments: the tables that are asked for.
         scope: how many conditions there are.
-        folder: for the report, and for the results of each drive, with which an interrupted run goes on.
+        folder: for the report, and for the results of each sequence, with which an interrupted run goes on.
         about: lines on the report's first page.
         workers: processes.
         use_ray: run on a Ray cluster; see `run_study`.
@@ -52,7 +52,7 @@ def reproduce(
     if len(set(labels)) < len(labels):
         raise ValueError(f"the same data twice: {', '.join(labels)}")
     for settings in studies:
-        drive_names(settings)  # what is not there is said before hours of work
+        sequence_names(settings)  # what is not there is said before hours of work
     conditions = conditions_of(experiments, scope)
     parts = []
     for settings in studies:
@@ -61,8 +61,8 @@ def reproduce(
         def show(done: float, total: float, label: str = settings.label) -> None:
             progress(label, done, total)
 
-        drives = Path(folder) / settings.label.replace(" ", "_") / "drives"
-        runs = run_study(settings, conditions, drives, workers=workers, use_ray=use_ray, progress=show)
+        sequences = Path(folder) / settings.label.replace(" ", "_") / "sequences"
+        runs = run_study(settings, conditions, sequences, workers=workers, use_ray=use_ray, progress=show)
         results = Results(runs, models.evaluation_range, settings.min_points)
         if not results.frame_count:
             left_out = ", ".join(f"{count} {what}" for what, count in sorted(results.left_out.items()))

@@ -1,4 +1,4 @@
-"""What came out of one drive under some conditions, in memory and on disk.
+"""Results of one sequence under several conditions, in memory and on disk.
 
 A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with everything but boxes; `boxes`, the
 (M, 8) detections x, y, z, l, w, h [m], yaw [rad], score of all conditions and frames in the document's order; and
@@ -22,14 +22,22 @@ from cobevglue.datasets.whole_files import whole_file
 from cobevglue.experiments.condition import Condition
 from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["ConditionResult", "FrameResult", "FrameTruth", "Heard", "ScenarioResult", "read_result", "write_result"]
+__all__ = [
+    "ConditionResult",
+    "FrameResult",
+    "FrameTruth",
+    "ReceivedPose",
+    "ScenarioResult",
+    "read_result",
+    "write_result",
+]
 
 _FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """One collaborator in one frame.
+class ReceivedPose:
+    """The pose and messages of one collaborator in one frame.
 
     Attributes:
         agent: its name.
@@ -37,7 +45,7 @@ class Heard:
         yaw_error: of its pose, magnitude [rad]; infinite where it was refused.
         landing_error: how far its boxes lie from where the true pose puts them [m]; infinite where it was refused.
         reason: why its pose was refused; "" where it was accepted.
-        message_bytes: what it sent, by kind.
+        message_bytes: size of its messages by kind.
         alignment_bytes: the part of it that was sent for alignment.
     """
 
@@ -61,22 +69,22 @@ class Heard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What the ego concluded in one frame: boxes with scores in its LiDAR frame, from whom, and the time [s]."""
+    """The ego's result in one frame: boxes with scores in its LiDAR frame, collaborators, and times [s] by stage."""
 
     boxes: Boxes
-    heard: tuple[Heard, ...]
+    heard: tuple[ReceivedPose, ...]
     seconds: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """The truth of one frame.
+    """The ground truth of one frame.
 
     Attributes:
         timestamp: name of the frame.
         objects: K vehicles that any agent could see, in the ego's LiDAR frame.
         point_count: (K,) points of all agents together on each of them.
-        co_visible: by collaborator, how many of them both it and the ego detected.
+        co_visible: by collaborator, the number of objects that both it and the ego detected.
         seconds: of perception's stages, summed over agents [s].
     """
 
@@ -89,10 +97,10 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConditionResult:
-    """A drive under one condition.
+    """A sequence under one condition.
 
     Attributes:
-        condition: which one.
+        condition: the condition.
         fingerprint: of the method's weights.
         frames: by the number of the frame in the result's truth.
     """
@@ -104,13 +112,13 @@ class ConditionResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenarioResult:
-    """A drive under all conditions.
+    """A sequence under all conditions.
 
     Attributes:
-        scenario: name of the drive.
-        ego: who looks; "" where no frame had a vehicle with a cloud.
-        truth: of every frame that was used.
-        left_out: what was not used, and how often: "agents without a cloud", "frames without the ego".
+        scenario: name of the sequence.
+        ego: name of the ego; "" where no frame had a vehicle with a cloud.
+        truth: ground truth of every evaluated frame.
+        left_out: reasons for skipped data with counts: "agents without a cloud", "frames without the ego".
         conditions: by their keys.
     """
 
@@ -182,7 +190,7 @@ def read_result(path: Path) -> ScenarioResult:
             raise ValueError(f"format {document['format']}, this version of cobevglue reads format {_FORMAT}")
         return _result(document, boxes, truth)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: damaged, or no result of a drive: {error}") from None
+        raise ValueError(f"{path}: damaged, or no result of a sequence: {error}") from None
 
 
 def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -> ScenarioResult:
@@ -196,7 +204,7 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
     for one in document["conditions"]:
         frames = {}
         for frame in one["frames"]:
-            heard = tuple(Heard(**_infinite(part)) for part in frame["heard"])
+            heard = tuple(ReceivedPose(**_infinite(part)) for part in frame["heard"])
             frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), heard, frame["seconds"])
             row += frame["boxes"]
         condition = Condition(**one["condition"])

@@ -1,4 +1,4 @@
-"""Runs a study: a file for each drive, several processes or a Ray cluster, and an interrupted run goes on."""
+"""Runs a study: a file for each sequence, several processes or a Ray cluster, and an interrupted run goes on."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from cobevglue.datasets.whole_files import write_json
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.results import ConditionResult, ScenarioResult, read_result, write_result
-from cobevglue.experiments.run import PERCEPTION_COST, run_drive
-from cobevglue.experiments.study import StudySettings, drive_names, open_drive
+from cobevglue.experiments.run import PERCEPTION_COST, run_sequence
+from cobevglue.experiments.study import StudySettings, open_sequence, sequence_names
 from cobevglue.torch_threads import torch_threads
 
 __all__ = ["run_study"]
@@ -34,7 +34,7 @@ _Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class _Job:
-    """A drive, and the conditions that it is still to be run under."""
+    """A sequence, and the conditions that it is still to be run under."""
 
     settings: StudySettings
     number: int
@@ -50,7 +50,7 @@ def run_study(
     use_ray: bool = False,
     progress: _Progress = lambda done, total: None,
 ) -> list[ScenarioResult]:
-    """Run every drive of a study under every condition, or take from `folder` what was run before.
+    """Run every sequence of a study under every condition, or take from `folder` what was run before.
 
     The results are the same with any number of workers, but for the times.
 
@@ -63,14 +63,14 @@ def run_study(
         progress: called with the work that is done and that there is in all, in frames of one condition.
 
     Returns:
-        The results of all drives in order.
+        The results of all sequences in order.
 
     Raises:
         ValueError: bad settings, no such data, or the folder has results of another study; says what differs.
         FileNotFoundError: the data or weights are not there.
         ModuleNotFoundError: something is not installed: the simulation, or Ray.
     """
-    names = drive_names(settings)
+    names = sequence_names(settings)
     models = Models(settings)
     unique = list({condition.key: condition for condition in conditions}.values())
     for condition in unique:
@@ -99,7 +99,7 @@ def run_study(
 def _claim(folder: Path, settings: StudySettings, detector: str) -> None:
     """Make the folder that of this study, or refuse one of another."""
     study = {"version": __version__, "detector_weights": detector, **settings.model_dump(mode="json")}
-    # What does not change results: how many drives there are, and where fusion weights are; those have fingerprints.
+    # What does not change results: how many sequences there are, and where fusion weights are; those have fingerprints.
     for name in ("scenarios", "weights", "untrained"):
         del study[name]
     path = folder / _STUDY_FILE
@@ -217,15 +217,15 @@ def _run_in_worker(job: _Job) -> ScenarioResult:
 
 
 def _run(job: _Job, models: Models, report: Callable[[float], None]) -> ScenarioResult:
-    drive = open_drive(job.settings, job.number)
-    return run_drive(job.settings, drive, job.number, job.conditions, models, report)
+    sequence = open_sequence(job.settings, job.number)
+    return run_sequence(job.settings, sequence, job.number, job.conditions, models, report)
 
 
 def _work_of(jobs: Sequence[_Job]) -> float:
-    """Frames of one condition, as far as this is known before the drives are gone through."""
+    """Frames of one condition, as far as this is known before the sequences are gone through."""
     total = 0.0
     for job in jobs:
-        frames = len(open_drive(job.settings, job.number))
+        frames = len(open_sequence(job.settings, job.number))
         frames = min(frames, job.settings.frames or frames)
         total += frames * (PERCEPTION_COST + sum(1.0 / condition.every for condition in job.conditions))
     return total

@@ -1,4 +1,4 @@
-"""How good the poses are that each aligner finds."""
+"""The quality of each aligner's poses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results, pose_quality
-from cobevglue.experiments.results import Heard
+from cobevglue.experiments.results import ReceivedPose
 from cobevglue.experiments.table import Cell, Table
 from cobevglue.experiments.tables.scope import Experiment, Scope, aligner_title, as_is, level_name
 from cobevglue.fusion import FUSION_METHODS
@@ -25,7 +25,7 @@ _GROUPS: dict[str, tuple[int, float]] = {
 
 
 def _sources(scope: Scope) -> dict[str, str]:
-    """By source of poses, the first method that has it."""
+    """The first method with each source of poses."""
     sources: dict[str, str] = {}
     for name in (*scope.localised, *scope.trusting):
         sources.setdefault(FUSION_METHODS[name].usual_aligner, name)
@@ -50,11 +50,15 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         if heard:
             groups.append([group, *_cells(heard)])
     notes = ("Wrong: off by more than 3 m or 3°. A refusal is neither right nor wrong, and counts as no success.",)
-    seen = ("Co-visible: objects of the truth that tracked boxes of both agents overlap.",)
+    note = ("Co-visible: ground-truth objects that tracked boxes of both agents overlap.",)
     return [
         Table("poses", "Poses by source and localisation noise", columns, rows, notes),
         Table(
-            "poses_co_visible", "BEVGlue by the number of co-visible objects", ("co-visible", *_COLUMNS), groups, seen
+            "poses_co_visible",
+            "BEVGlue by the number of co-visible objects",
+            ("co-visible", *_COLUMNS),
+            groups,
+            note,
         ),
     ]
 
@@ -71,7 +75,7 @@ _COLUMNS = (
 )
 
 
-def _cells(heard: Sequence[Heard]) -> list[Cell]:
+def _cells(heard: Sequence[ReceivedPose]) -> list[Cell]:
     quality = pose_quality(heard)
     shares = quality.refused, quality.success_1, quality.success_2, quality.success_3, quality.wrong
     return [quality.count, *shares, quality.translation, quality.yaw]
