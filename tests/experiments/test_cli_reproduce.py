@@ -75,7 +75,7 @@ def test_a_second_data_set_stands_beside(tiny: Path, tmp_path: Path, capsys: pyt
         (("--split", "tset"), "no split 'tset'; did you mean 'test'"),
         (("--root", "/nowhere"), "no folder /nowhere"),
         (("--detector", "compakt"), "no pretrained detector 'compakt'; did you mean 'compact'"),
-        (("--dataset", "simulated"), "simulated drives have no root"),
+        (("--dataset", "simulated"), "simulated sequences have no root"),
         (("--dataset", "dair-v2x"), "looked for"),
         (("--frames", "0"), "--frames"),
         (("--real", "/nowhere"), "no folder /nowhere"),
@@ -131,4 +131,4 @@ def test_the_recorded_command_repeats_repeated_options() -> None:
 def test_reader_options_are_refused_for_simulated_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reproduce", "--out", str(tmp_path), "--dataset-option", "labels=original"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "have no effect on simulated drives: {'labels': 'original'}" in line
+    assert "have no effect on simulated sequences: {'labels': 'original'}" in line

@@ -22,7 +22,7 @@ def rows_of(table: dict[str, Any]) -> Rows:
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Rows]:
-    """By name, of a study of simulated drives."""
+    """By name, of a study of simulated sequences."""
     pytest.importorskip("libsumo")
     out = tmp_path_factory.mktemp("quick")
     with contextlib.redirect_stdout(io.StringIO()) as printed:

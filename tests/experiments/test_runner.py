@@ -27,9 +27,9 @@ CONDITIONS = [
 def numbers(results: list[ScenarioResult]) -> list[object]:
     """Everything but the times."""
     return [
-        (drive.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.heard)
-        for drive in results
-        for key, run in sorted(drive.conditions.items())
+        (sequence.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.received)
+        for sequence in results
+        for key, run in sorted(sequence.conditions.items())
         for index, frame in run.frames.items()
     ]
 
@@ -45,10 +45,10 @@ def whole(settings: StudySettings, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_every_drive_is_run_under_every_condition_once(whole: list[ScenarioResult]) -> None:
-    assert [drive.scenario for drive in whole] == ["a_pair", "b_three"]
-    for drive in whole:
-        assert list(drive.conditions) == [condition.key for condition in CONDITIONS]
-        assert all(list(run.frames) == [0, 1, 2] for run in drive.conditions.values())
+    assert [sequence.scenario for sequence in whole] == ["a_pair", "b_three"]
+    for sequence in whole:
+        assert list(sequence.conditions) == [condition.key for condition in CONDITIONS]
+        assert all(list(run.frames) == [0, 1, 2] for run in sequence.conditions.values())
 
 
 def test_an_interrupted_run_goes_on(settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_finished_conditions_are_not_run_again(settings: StudySettings, tmp_path
     assert run_study(settings, CONDITIONS[:2], tmp_path, progress=lambda *now: progress.extend(now))
     assert not progress
     more = run_study(settings, CONDITIONS[1:], tmp_path, progress=lambda *now: progress.extend(now))
-    assert max(progress) == 2 * 3 * (10 + 1)  # two drives of three frames: perception, and the condition that is new
+    assert max(progress) == 2 * 3 * (10 + 1)  # two sequences of three frames: perception, and the condition that is new
     assert list(more[0].conditions) == [condition.key for condition in CONDITIONS[1:]]
     progress.clear()
     run_study(settings, CONDITIONS, tmp_path, progress=lambda *now: progress.extend(now))
@@ -175,7 +175,7 @@ def test_a_local_ray_cluster_gives_the_same(
     [
         ({"dataset": "opv2w"}, ValueError, "no data set 'opv2w'; did you mean 'opv2v'"),
         ({"dataset": "opv2v", "root": None}, ValueError, "the data set opv2v needs a root"),
-        ({"dataset": "simulated"}, ValueError, "simulated drives have no root"),
+        ({"dataset": "simulated"}, ValueError, "simulated sequences have no root"),
         ({"split": "tset"}, ValueError, "no split 'tset'; did you mean 'test'"),
         ({"root": "/nowhere"}, FileNotFoundError, "no folder /nowhere"),
         ({"detector": "compakt"}, ValueError, "no pretrained detector 'compakt'; did you mean 'compact'"),

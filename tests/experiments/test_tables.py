@@ -26,7 +26,7 @@ ALL = list(EXPERIMENTS.values())
 
 @pytest.fixture(scope="module")
 def results(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """All that the quick tables need, of one drive."""
+    """All that the quick tables need, of one sequence."""
     settings = tiny_settings(tiny, scenarios=1, frames=2)
     runs = run_study(settings, conditions_of(ALL, QUICK), tmp_path_factory.mktemp("drives"))
     return Results(runs, Models(settings).evaluation_range, settings.min_points)
@@ -49,11 +49,11 @@ def test_a_table_needs_only_what_it_asked_for(results: Results, experiment: obje
 
     assert isinstance(experiment, Experiment)
     wanted = {condition.key for condition in experiment.conditions(QUICK)}
-    drives = [
-        replace(drive, conditions={key: run for key, run in drive.conditions.items() if key in wanted})
-        for drive in results.drives
+    sequences = [
+        replace(sequence, conditions={key: run for key, run in sequence.conditions.items() if key in wanted})
+        for sequence in results.sequences
     ]
-    alone = Results(drives, results.evaluation_range, results.min_points)
+    alone = Results(sequences, results.evaluation_range, results.min_points)
     tables = experiment.tables(QUICK, alone, "simulated")
     assert tables
     assert all(table.rows and table.to_markdown() and table.to_csv() for table in tables)
@@ -154,7 +154,7 @@ def test_the_summary_leaves_out_what_was_not_run(results: Results) -> None:
     only = Results(
         [
             type(d)(d.scenario, d.ego, d.truth, d.left_out, {as_is("none").key: d.conditions[as_is("none").key]})
-            for d in results.drives
+            for d in results.sequences
         ],
         results.evaluation_range,
         results.min_points,

@@ -1,4 +1,4 @@
-"""The figures of a report: curves over noise and bytes, and what methods saw in one frame."""
+"""The figures of a report: curves over noise and bytes, and detections in one frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.observed_sequence import ObservedSequence
-from cobevglue.experiments.study import StudySettings, drive_frames, drive_names, open_drive
+from cobevglue.experiments.study import StudySettings, open_sequence, sequence_frames, sequence_names
 from cobevglue.experiments.tables.noise import noise_curves
 from cobevglue.experiments.tables.registration import registration_points
 from cobevglue.experiments.tables.scope import Scope, aligner_title, as_is, method_title, needs
@@ -34,9 +34,9 @@ _SHOWN = ("v2x-vit", "coalign", "cobevglue")
 _NOISE = 3.0
 """The noise of that figure [m, degrees]."""
 _FRAMES = 10
-"""So many frames of the drive are gone through; the last one is shown."""
+"""Number of frames of the sequence that are run; the last one is shown."""
 _SCORE = 0.3
-"""Detections that score less are not shown."""
+"""Detections with lower scores are not shown."""
 
 
 def noise_pictures(scope: Scope, results: Results) -> list[Picture]:
@@ -52,84 +52,84 @@ def noise_pictures(scope: Scope, results: Results) -> list[Picture]:
 
 
 def registration_pictures(scope: Scope, results: Results) -> list[Picture]:
-    """Average precision over communication."""
+    """Average precision over bytes for alignment."""
     from cobevglue.visualization.study_figures import ap_over_bytes
 
-    title = "AP@0.5 over what is sent for alignment"
+    title = "AP@0.5 over bytes sent for alignment"
     return [(title, ap_over_bytes(registration_points(scope, results, 0.5), title))]
 
 
 def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> list[Picture]:
-    """One frame of the first drive in which the ego has company: the paper's Figures 5 and 6.
+    """One frame of the first sequence with a collaborator: the paper's Figures 5 and 6.
 
-    What methods detect under noise; and where registration of points and BEVGlue put what collaborators saw.
+    They show detections under noise, clouds aligned by point registration, and objects matched by BEVGlue.
     """
     from cobevglue.visualization.study_figures import detections_picture, matching_picture
 
-    drive = _drive_in_company(settings, models)
-    if drive is None:
+    sequence = _first_collaborative_sequence(settings, models)
+    if sequence is None:
         return []
-    ego, frame, truth = drive.ego, drive.frames[-1], drive.truth[-1]
+    ego, frame, truth = sequence.ego, sequence.frames[-1], sequence.truth[-1]
     counted = inside(truth.objects, models.evaluation_range) & (truth.point_count >= settings.min_points)
     objects = truth.objects[counted]
     (ours,) = scope.localised
     pictures = []
     for name in _SHOWN:
         if name in scope.methods:
-            out = _run(as_is(name, _NOISE), drive, models, settings.seed)
+            out = _run(as_is(name, _NOISE), sequence, models, settings.seed)
             title = f"{method_title(name)}, noise {_NOISE:g} m, {_NOISE:g}°"
             caption = f"{title}: true boxes in green, detections of score {_SCORE:g} and more in red."
             clouds = _clouds(frame, ego, _true_poses(frame, ego))
-            pictures.append((caption, detections_picture(clouds, objects, _sure(out.boxes), title)))
+            pictures.append((caption, detections_picture(clouds, objects, _confident(out.boxes), title)))
     for aligner in scope.registrations:
         if not needs(aligner, "pose"):
             condition = as_is(ours, 0.0, aligner, aligner_options={"budget_bytes": scope.budgets[-1]})
-            out = _run(condition, drive, models, settings.seed, last_only=True)
+            out = _run(condition, sequence, models, settings.seed, last_only=True)
             title = f"{aligner_title(aligner)} on {scope.budgets[-1]:,} bytes of points"
-            caption = f"{title}: all clouds where it puts them, true boxes in green. {_errors(frame, ego, out)}."
+            caption = f"{title}: all clouds aligned by its poses, true boxes in green. {_errors(frame, ego, out)}."
             clouds = _clouds(frame, ego, {name: one.ego_SE2_other for name, one in out.alignments.items()})
             pictures.append((caption, detections_picture(clouds, objects, Boxes.empty(), title)))
-    out = _run(as_is(ours), drive, models, settings.seed)
+    out = _run(as_is(ours), sequence, models, settings.seed)
     for other, alignment in out.alignments.items():
         sent = out.alignment_bytes[other]
-        caption = f"BEVGlue on {sent:,} bytes of boxes, those that match joined. {_errors(frame, ego, out, other)}."
+        caption = f"BEVGlue on {sent:,} bytes of boxes, matched ones joined. {_errors(frame, ego, out, other)}."
         pictures.append(
             (caption, matching_picture(frame.observations[ego].boxes, frame.observations[other].boxes, alignment))
         )
     return pictures
 
 
-def _drive_in_company(settings: StudySettings, models: Models) -> ObservedSequence | None:
-    """The first drive at whose last shown frame there are others, gone through up to there."""
-    for number in range(len(drive_names(settings))):
-        drive = ObservedSequence(models.detector)
-        drive.observe(islice(drive_frames(settings, open_drive(settings, number)), _FRAMES))
-        if drive.frames and drive.frames[-1].collaborators(drive.ego):
-            return drive
+def _first_collaborative_sequence(settings: StudySettings, models: Models) -> ObservedSequence | None:
+    """The first sequence with collaborators in the shown frame, observed up to this frame."""
+    for number in range(len(sequence_names(settings))):
+        sequence = ObservedSequence(models.detector)
+        sequence.observe(islice(sequence_frames(settings, open_sequence(settings, number)), _FRAMES))
+        if sequence.frames and sequence.frames[-1].collaborators(sequence.ego):
+            return sequence
     return None
 
 
 def _run(
-    condition: Condition, drive: ObservedSequence, models: Models, seed: int, last_only: bool = False
+    condition: Condition, sequence: ObservedSequence, models: Models, seed: int, last_only: bool = False
 ) -> StepOutput:
-    """What the ego concludes in the last frame; who remembers has seen those before."""
+    """The output for the last frame; unless `last_only`, all frames before it are run, too."""
     system = CoBEVGlue(models.detector, models.method(condition.fusion), models.aligner(condition))
     disturbance = condition.make_disturbance()
-    last = len(drive.frames) - 1
+    last = len(sequence.frames) - 1
     for index in range(last if last_only else 0, last + 1):
-        frame = disturbance.apply(drive.frames, index, drive.ego, (seed, 0))
-        out = system.collaborate(frame.observations, drive.ego, frame.time, frame.claimed)
+        frame = disturbance.apply(sequence.frames, index, sequence.ego, (seed, 0))
+        out = system.collaborate(frame.observations, sequence.ego, frame.time, frame.claimed)
     return out
 
 
 def _true_poses(frame: ObservedFrame, ego: str) -> dict[str, SE2]:
-    """Of all collaborators in the ego's frame."""
+    """True poses of all collaborators in the ego's frame."""
     ego_SE3_world = inverse_SE3(frame.true[ego])
     return {other: SE2.from_matrix(ego_SE3_world @ frame.true[other]) for other in frame.collaborators(ego)}
 
 
 def _clouds(frame: ObservedFrame, ego: str, poses: Mapping[str, SE2 | None]) -> list[FloatArray]:
-    """The ego's points, and those of the others by these poses; without a pose they are left out."""
+    """The ego's points and those of the others, transformed by these poses; agents without a pose are left out."""
     clouds = [frame.observations[ego].points[:, :3].astype(np.float64)]
     for other, ego_SE2_other in poses.items():
         if ego_SE2_other is not None:
@@ -138,7 +138,7 @@ def _clouds(frame: ObservedFrame, ego: str, poses: Mapping[str, SE2 | None]) -> 
 
 
 def _errors(frame: ObservedFrame, ego: str, out: StepOutput, only: str = "") -> str:
-    """How far off the poses are."""
+    """The pose errors as text."""
     parts = []
     for other, truth in _true_poses(frame, ego).items():
         if only in ("", other):
@@ -147,9 +147,9 @@ def _errors(frame: ObservedFrame, ego: str, out: StepOutput, only: str = "") -> 
                 parts.append(f"{other}: refused, {out.alignments[other].reason}")
             else:
                 shift, turn = pose.error_to(truth)
-                parts.append(f"{other}: off by {shift:.2f} m, {math.degrees(turn):.2f}°")
+                parts.append(f"{other}: error {shift:.2f} m, {math.degrees(turn):.2f}°")
     return "; ".join(parts)
 
 
-def _sure(boxes: Boxes) -> Boxes:
+def _confident(boxes: Boxes) -> Boxes:
     return boxes if boxes.score is None else boxes[boxes.score >= _SCORE]

@@ -1,8 +1,8 @@
-"""What came out of one drive under some conditions, in memory and on disk.
+"""Results of one sequence under some conditions, in memory and on disk.
 
-A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with everything but boxes; `boxes`, the
+A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with all but the boxes; `boxes`, the
 (M, 8) detections x, y, z, l, w, h [m], yaw [rad], score of all conditions and frames in the document's order; and
-`truth`, the (K, 7) true boxes of all frames. It is written as a whole, and nothing in it is code.
+`truth`, the (K, 7) true boxes of all frames. It is written atomically and contains no pickled objects.
 """
 
 from __future__ import annotations
@@ -22,23 +22,31 @@ from cobevglue.datasets.whole_files import whole_file
 from cobevglue.experiments.condition import Condition
 from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["ConditionResult", "FrameResult", "FrameTruth", "Heard", "ScenarioResult", "read_result", "write_result"]
+__all__ = [
+    "ConditionResult",
+    "FrameResult",
+    "FrameTruth",
+    "ReceivedPose",
+    "ScenarioResult",
+    "read_result",
+    "write_result",
+]
 
 _FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """One collaborator in one frame.
+class ReceivedPose:
+    """The pose and messages of one collaborator in one frame.
 
     Attributes:
         agent: its name.
         translation_error: of its pose [m]; infinite where it was refused.
         yaw_error: of its pose, magnitude [rad]; infinite where it was refused.
-        landing_error: how far its boxes lie from where the true pose puts them [m]; infinite where it was refused.
+        landing_error: distance of its boxes from their places by the true pose [m]; infinite where it was refused.
         reason: why its pose was refused; "" where it was accepted.
-        message_bytes: what it sent, by kind.
-        alignment_bytes: the part of it that was sent for alignment.
+        message_bytes: bytes sent, by kind of message.
+        alignment_bytes: bytes of these for alignment.
     """
 
     agent: str
@@ -61,23 +69,29 @@ class Heard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What the ego concluded in one frame: boxes with scores in its LiDAR frame, from whom, and the time [s]."""
+    """The ego's output in one frame.
+
+    Attributes:
+        boxes: detections with scores, in the ego's LiDAR frame.
+        received: the pose of each collaborator.
+        seconds: time of each stage [s].
+    """
 
     boxes: Boxes
-    heard: tuple[Heard, ...]
+    received: tuple[ReceivedPose, ...]
     seconds: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """The truth of one frame.
+    """Ground truth of one frame.
 
     Attributes:
         timestamp: name of the frame.
-        objects: K vehicles that any agent could see, in the ego's LiDAR frame.
+        objects: K vehicles labelled by any agent, in the ego's LiDAR frame.
         point_count: (K,) points of all agents together on each of them.
-        co_visible: by collaborator, how many of them both it and the ego detected.
-        seconds: of perception's stages, summed over agents [s].
+        co_visible: by collaborator, number of objects that both it and the ego detected.
+        seconds: time of each perception stage, summed over agents [s].
     """
 
     timestamp: str
@@ -89,12 +103,12 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConditionResult:
-    """A drive under one condition.
+    """A sequence under one condition.
 
     Attributes:
-        condition: which one.
+        condition: settings of the run.
         fingerprint: of the method's weights.
-        frames: by the number of the frame in the result's truth.
+        frames: by frame index in `ScenarioResult.truth`.
     """
 
     condition: Condition
@@ -104,13 +118,13 @@ class ConditionResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenarioResult:
-    """A drive under all conditions.
+    """A sequence under all conditions.
 
     Attributes:
-        scenario: name of the drive.
-        ego: who looks; "" where no frame had a vehicle with a cloud.
-        truth: of every frame that was used.
-        left_out: what was not used, and how often: "agents without a cloud", "frames without the ego".
+        scenario: name of the sequence.
+        ego: name of the ego; "" where no frame had a vehicle with a cloud.
+        truth: of each frame used.
+        left_out: reasons for skipping, with their counts: "agents without a cloud", "frames without the ego".
         conditions: by their keys.
     """
 
@@ -122,7 +136,7 @@ class ScenarioResult:
 
 
 def write_result(path: Path, result: ScenarioResult) -> None:
-    """Write the file; it appears complete or not at all."""
+    """Write the file atomically."""
     truth = [
         {
             "timestamp": one.timestamp,
@@ -142,7 +156,7 @@ def write_result(path: Path, result: ScenarioResult) -> None:
                 {
                     "frame": index,
                     "boxes": len(frame.boxes),
-                    "heard": [_finite(asdict(heard)) for heard in frame.heard],
+                    "heard": [_finite(asdict(pose)) for pose in frame.received],
                     "seconds": frame.seconds,
                 }
                 for index, frame in run.frames.items()
@@ -169,10 +183,10 @@ def write_result(path: Path, result: ScenarioResult) -> None:
 
 
 def read_result(path: Path) -> ScenarioResult:
-    """Read what `write_result` wrote.
+    """Read a file of `write_result`.
 
     Raises:
-        ValueError: the file is damaged, or of something else; names it.
+        ValueError: the file is damaged or not a result; names it.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -182,7 +196,7 @@ def read_result(path: Path) -> ScenarioResult:
             raise ValueError(f"format {document['format']}, this version of cobevglue reads format {_FORMAT}")
         return _result(document, boxes, truth)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: damaged, or no result of a drive: {error}") from None
+        raise ValueError(f"{path}: damaged, or not the result of a sequence: {error}") from None
 
 
 def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -> ScenarioResult:
@@ -196,8 +210,8 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
     for one in document["conditions"]:
         frames = {}
         for frame in one["frames"]:
-            heard = tuple(Heard(**_infinite(part)) for part in frame["heard"])
-            frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), heard, frame["seconds"])
+            received = tuple(ReceivedPose(**_infinite(part)) for part in frame["heard"])
+            frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), received, frame["seconds"])
             row += frame["boxes"]
         condition = Condition(**one["condition"])
         conditions[condition.key] = ConditionResult(condition, one["fingerprint"], frames)
@@ -205,7 +219,7 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
 
 
 def _rows(parts: Sequence[Boxes], width: int) -> FloatArray:
-    """(M, width) numbers of all boxes."""
+    """(M, width) box parameters of all parts."""
     rows = [np.zeros((0, width))]
     for boxes in parts:
         score = [boxes.score] if boxes.score is not None else [np.zeros(len(boxes))]
@@ -219,7 +233,7 @@ def _boxes(rows: FloatArray, labels: list[str] | None = None) -> Boxes:
 
 
 def _finite(record: dict[str, Any]) -> dict[str, Any]:
-    """Errors of a refused pose are infinite, which JSON does not know: null."""
+    """Infinite errors of refused poses as null: JSON has no infinity."""
     return {k: None if isinstance(v, float) and math.isinf(v) else v for k, v in record.items()}
 
 

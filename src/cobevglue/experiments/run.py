@@ -1,4 +1,4 @@
-"""One drive under many conditions. Perception is run once, and each method's messages are made once."""
+"""Runs one sequence under many conditions. Perception is run once, and each method encodes each message once."""
 
 from __future__ import annotations
 
@@ -16,52 +16,52 @@ from cobevglue.evaluation.alignment import landing_error
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.observed_sequence import ObservedSequence
-from cobevglue.experiments.results import ConditionResult, FrameResult, Heard, ScenarioResult
-from cobevglue.experiments.study import StudySettings, drive_frames
+from cobevglue.experiments.results import ConditionResult, FrameResult, ReceivedPose, ScenarioResult
+from cobevglue.experiments.study import StudySettings, sequence_frames
 from cobevglue.fusion import FusionMethod, Received
 from cobevglue.messages import Arrays
 from cobevglue.perception import PerceptionOutput
 from cobevglue.se2 import SE2
 from cobevglue.system import CoBEVGlue, StepOutput
 
-__all__ = ["PERCEPTION_COST", "MessageMemo", "run_drive"]
+__all__ = ["PERCEPTION_COST", "MessageMemo", "run_sequence"]
 
 PERCEPTION_COST = 10
-"""What seeing a frame costs, in conditions of that frame; for the estimate of the time that is left."""
+"""Cost of perception relative to one condition, both for one frame; for the estimate of the remaining time."""
 _BLOCK = 20
-"""So many frames are in memory at a time, and as many before them: all that a disturbance may look back to."""
+"""Number of frames per block. The current block and the previous one, which disturbances may use, are in memory."""
 
 _Progress = Callable[[float], None]
 
 
-def run_drive(
+def run_sequence(
     settings: StudySettings,
-    drive: Scenario,
+    sequence: Scenario,
     number: int,
     conditions: Sequence[Condition],
     models: Models,
     progress: _Progress = lambda work: None,
 ) -> ScenarioResult:
-    """Go through a drive under all conditions.
+    """Run a sequence under all conditions.
 
     Args:
         settings: of the study.
-        drive: the frames; consecutive.
-        number: of the drive in the study, for random numbers.
-        conditions: with keys that differ.
+        sequence: consecutive frames.
+        number: index of the sequence in the study; part of the random seed.
+        conditions: with distinct keys.
         models: the networks.
-        progress: called with the work that was done, in frames of one condition.
+        progress: called with the work since the last call, in frames of one condition.
 
     Raises:
         ValueError: a broken file; names it.
     """
-    sequence = ObservedSequence(models.detector)
+    observed = ObservedSequence(models.detector)
     memos = {condition.fusion: MessageMemo(models.method(condition.fusion)) for condition in conditions}
     runs = [_Run(condition, models, memos[condition.fusion], (settings.seed, number)) for condition in conditions]
     runs.sort(key=lambda run: list(memos).index(run.condition.fusion))  # so that only one memo is full at a time
-    frames = iter(drive_frames(settings, drive))
+    frames = iter(sequence_frames(settings, sequence))
     while block := list(islice(frames, _BLOCK)):
-        new = sequence.observe(block)
+        new = observed.observe(block)
         progress(PERCEPTION_COST * len(block))
         fusion = ""
         for run in runs:
@@ -70,16 +70,16 @@ def run_drive(
                 for memo in memos.values():
                     memo.clear()
             for index in new:
-                run.step(sequence, index)
+                run.step(observed, index)
             progress(len(block) / run.condition.every)
         for memo in memos.values():
             memo.clear()
-        sequence.drop_observations(before=new.start)
+        observed.drop_observations(before=new.start)
     return ScenarioResult(
-        drive.name,
-        sequence.ego,
-        sequence.truth,
-        dict(sequence.left_out),
+        sequence.name,
+        observed.ego,
+        observed.truth,
+        dict(observed.left_out),
         {
             run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition), run.frames)
             for run in runs
@@ -88,7 +88,7 @@ def run_drive(
 
 
 class _Run:
-    """A condition on its way through a drive."""
+    """The state of one condition in a sequence."""
 
     def __init__(self, condition: Condition, models: Models, memo: MessageMemo, key: tuple[int, ...]) -> None:
         self.condition = condition
@@ -98,55 +98,56 @@ class _Run:
         self._disturbance: Disturbance = condition.make_disturbance()
         self._key = key
 
-    def step(self, drive: ObservedSequence, index: int) -> None:
-        """The next frame."""
+    def step(self, observed: ObservedSequence, index: int) -> None:
+        """Run the next frame, frame `index`."""
         if index % self.condition.every:
             return
-        frame = self._disturbance.apply(drive.frames, index, drive.ego, self._key)
+        frame = self._disturbance.apply(observed.frames, index, observed.ego, self._key)
         if self.condition.forget:
             self._system.aligner.reset()
         poses = frame.true if self.condition.true_poses else frame.claimed
         self._memo.saved = 0.0
-        out = self._system.collaborate(frame.observations, drive.ego, frame.time, poses)
+        out = self._system.collaborate(frame.observations, observed.ego, frame.time, poses)
         out.seconds["messages"] += self._memo.saved
-        self.frames[index] = FrameResult(_numbers(out.boxes), tuple(_heard(frame, drive.ego, out)), out.seconds)
+        received = tuple(_received_poses(frame, observed.ego, out))
+        self.frames[index] = FrameResult(_without_labels(out.boxes), received, out.seconds)
 
 
-def _heard(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator[Heard]:
+def _received_poses(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator[ReceivedPose]:
     for agent, alignment in out.alignments.items():
         translation = yaw = landing = math.inf
         if alignment.ego_SE2_other is not None:
             truth = SE2.from_matrix(np.linalg.inv(frame.true[ego]) @ frame.true[agent])
             translation, yaw = alignment.ego_SE2_other.error_to(truth)
             landing = landing_error(alignment.ego_SE2_other, truth, frame.observations[agent].boxes)
-        yield Heard(
+        yield ReceivedPose(
             agent, translation, yaw, landing, alignment.reason, out.message_bytes[agent], out.alignment_bytes[agent]
         )
 
 
-def _numbers(boxes: Boxes) -> Boxes:
-    """The boxes without what is not kept."""
+def _without_labels(boxes: Boxes) -> Boxes:
+    """The boxes without labels and track ids, which are not stored."""
     return boxes.replace(label=None, track_id=None)
 
 
 class MessageMemo(FusionMethod):
-    """A fusion method that makes the message of a view only once.
+    """A fusion method that caches the message of each observation.
 
     Args:
-        method: whose messages and boxes these are.
+        method: the fusion method.
 
     Attributes:
-        saved: time that messages which were not made again had taken [s]; may be set to 0 at any time.
+        saved: time that cached messages took when they were encoded [s]; may be set to 0 at any time.
     """
 
     def __init__(self, method: FusionMethod) -> None:
         self._method = method
-        self.kind = method.kind  # type: ignore[misc]  # as this method has it
+        self.kind = method.kind  # type: ignore[misc]  # of this method
         self.saved = 0.0
         self._made: dict[int, tuple[PerceptionOutput, Arrays, float]] = {}
 
     def clear(self) -> None:
-        """Forget the messages."""
+        """Empty the cache."""
         self._made.clear()
 
     def message(self, observation: PerceptionOutput) -> Arrays:
@@ -157,7 +158,7 @@ class MessageMemo(FusionMethod):
             return message
         start = perf_counter()
         message = self._method.message(observation)
-        self._made[id(observation)] = observation, message, perf_counter() - start  # what is kept keeps its id
+        self._made[id(observation)] = observation, message, perf_counter() - start  # the reference keeps the id valid
         return message
 
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
