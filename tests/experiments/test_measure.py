@@ -1,4 +1,4 @@
-"""Numbers of a study, from results made by hand."""
+"""Metrics of a study on hand-made results."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def cars(*x: float, score: float | None = None) -> Boxes:
     return Boxes(np.column_stack([x, np.zeros(n), np.zeros(n)]), np.tile((4.0, 2.0, 1.5), (n, 1)), np.zeros(n), scores)
 
 
-def heard(agent: str, error: float, degrees: float, payload: int = 1000, alignment: int = 100) -> ReceivedPose:
+def received(agent: str, error: float, degrees: float, payload: int = 1000, alignment: int = 100) -> ReceivedPose:
     reason = "" if math.isfinite(error) else "doubtful"
     sent = {"features": payload, "boxes": alignment}
     return ReceivedPose(agent, error, math.radians(degrees), error, reason, sent, alignment)
 
 
 def results(*frames: tuple[Boxes, Boxes, tuple[ReceivedPose, ...]], points: int = 9, **kept: int) -> Results:
-    """One sequence: truth, detections and collaborators of each frame; all have 3 objects in common with the ego."""
+    """One sequence: truth, detections and received poses of each frame; 3 objects are co-visible with each agent."""
     truth = [
         FrameTruth(f"{i}", true, np.full(len(true), points), {h.agent: 3 for h in who}, {"head": 0.02 * (1 + len(who))})
         for i, (true, _, who) in enumerate(frames)
@@ -64,17 +64,17 @@ def test_precision_may_use_a_subset_of_frames() -> None:
 
 
 def test_bytes_are_of_one_collaborator_in_one_frame() -> None:
-    both = heard("a", 0.1, 0.1, 1000, 100), heard("b", 0.1, 0.1, 4000, 300)
+    both = received("a", 0.1, 0.1, 1000, 100), received("b", 0.1, 0.1, 4000, 300)
     made = results((cars(0), cars(score=0.5), both), (cars(0), cars(score=0.5), both[:1]))
     assert made.payload_bytes(CONDITION) == 2000.0
     assert made.alignment_bytes(CONDITION) == pytest.approx(500 / 3)
     alone = results((cars(0), cars(score=0.5), ()))
     assert math.isnan(alone.payload_bytes(CONDITION))
-    assert alone.lonely_frames == 1
+    assert alone.frames_without_collaborators == 1
 
 
 def test_times_are_medians_per_cloud() -> None:
-    company = (heard("a", 0.1, 0.1),)
+    company = (received("a", 0.1, 0.1),)
     made = results(*[(cars(0), cars(score=0.5), company)] * 3)
     assert made.milliseconds(CONDITION) == pytest.approx({"fusion": 20.0})
     assert made.perception_milliseconds() == pytest.approx({"head": 20.0})
@@ -89,11 +89,11 @@ def test_what_was_left_out_is_added_up() -> None:
 def test_success_refusals_and_wrong_poses_are_told_apart() -> None:
     quality = pose_quality(
         [
-            heard("good", 0.5, 0.5),
-            heard("fair", 1.5, 0.5),
-            heard("turned", 0.5, 2.5),
-            heard("wrong", 9.0, 0.0),
-            heard("refused", math.inf, math.inf),
+            received("good", 0.5, 0.5),
+            received("fair", 1.5, 0.5),
+            received("turned", 0.5, 2.5),
+            received("wrong", 9.0, 0.0),
+            received("refused", math.inf, math.inf),
         ]
     )
     assert (quality.count, quality.refused, quality.wrong) == (5, 0.2, 0.25)

@@ -25,7 +25,7 @@ pytest.importorskip("torch")
 CONDITION = Condition(
     fusion="cobevglue", aligner="bevglue", disturbance="noise", disturbance_options={"position": 0.5, "yaw": 0.5}
 )
-HEARD = ReceivedPose("car2", 0.25, 0.01, 0.5, "", {"boxes": 240, "features": 2_816_067}, 240)
+ACCEPTED = ReceivedPose("car2", 0.25, 0.01, 0.5, "", {"boxes": 240, "features": 2_816_067}, 240)
 REFUSED = ReceivedPose("car3", math.inf, math.inf, math.inf, "too few common objects", {"boxes": 0, "features": 7}, 0)
 
 
@@ -42,7 +42,7 @@ def result() -> ScenarioResult:
         ),
         FrameTruth("000002", boxes(0).replace(score=None), np.zeros(0, np.int64), {}, {"head": 0.25}),
     ]
-    frames = {0: FrameResult(boxes(2), (HEARD, REFUSED), {"fusion": 0.5}), 1: FrameResult(boxes(0), (), {})}
+    frames = {0: FrameResult(boxes(2), (ACCEPTED, REFUSED), {"fusion": 0.5}), 1: FrameResult(boxes(0), (), {})}
     other = CONDITION.model_copy(update={"fusion": "late", "every": 2})
     return ScenarioResult(
         "sequence one",
@@ -51,7 +51,7 @@ def result() -> ScenarioResult:
         {"agents without a cloud": 3},
         {
             CONDITION.key: ConditionResult(CONDITION, "abc", frames),
-            other.key: ConditionResult(other, "def", {0: FrameResult(boxes(4, 0.5), (HEARD,), {})}),
+            other.key: ConditionResult(other, "def", {0: FrameResult(boxes(4, 0.5), (ACCEPTED,), {})}),
         },
     )
 
@@ -80,7 +80,7 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         )
         for index, frame in run.frames.items():
             assert same(frame.boxes.replace(score=np.float32(frame.boxes.score)), read.frames[index].boxes)
-            assert (frame.heard, frame.seconds) == (read.frames[index].heard, read.frames[index].seconds)
+            assert (frame.received, frame.seconds) == (read.frames[index].received, read.frames[index].seconds)
 
 
 def test_a_drive_without_a_frame_reads_back(tmp_path: Path) -> None:
@@ -99,12 +99,12 @@ def test_damaged_or_foreign_file_is_named(tmp_path: Path, damage: str) -> None:
         path.write_text("no result")
     else:
         np.savez(path, boxes=np.zeros(3))
-    with pytest.raises(ValueError, match=r"one\.npz: damaged, or no result of a sequence"):
+    with pytest.raises(ValueError, match=r"one\.npz: damaged, or not the result of a sequence"):
         read_result(path)
 
 
 @pytest.mark.parametrize(("k", "within"), [(0.2, False), (0.5, False), (0.6, True), (3.0, True)])
 def test_success_needs_both_metres_and_degrees(k: float, within: bool) -> None:
-    assert HEARD.success(k) is within  # 0.25 m, 0.57 degrees
+    assert ACCEPTED.success(k) is within  # 0.25 m, 0.57 degrees
     assert not REFUSED.success(k)
-    assert (HEARD.accepted, REFUSED.accepted) == (True, False)
+    assert (ACCEPTED.accepted, REFUSED.accepted) == (True, False)

@@ -1,4 +1,4 @@
-"""One sequence under many conditions: who takes part, what is the truth, and what depends on what."""
+"""One sequence under many conditions: participating agents, ground truth, poses and messages."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def test_what_agents_claim_does_not_reach_bevglue(settings: StudySettings, attac
     attacked = OURS.model_copy(update=attack)
     result = run(settings, [OURS, attacked])
     assert numbers(result.conditions[attacked.key]) == numbers(result.conditions[OURS.key])
-    heard = [[one.heard for one in part.frames.values()] for part in result.conditions.values()]
-    assert heard[0] == heard[1]
+    received = [[one.received for one in part.frames.values()] for part in result.conditions.values()]
+    assert received[0] == received[1]
 
 
 def test_pose_errors_are_those_of_the_noise(settings: StudySettings) -> None:
     noisy = CLEAN.model_copy(update=STRONG)
     result = run(settings, [CLEAN, noisy])
-    assert result.conditions[CLEAN.key].frames[1].heard[0].translation_error == pytest.approx(0.0, abs=1e-9)
+    assert result.conditions[CLEAN.key].frames[1].received[0].translation_error == pytest.approx(0.0, abs=1e-9)
     noise = LocalisationNoise(position=2.5, yaw=2.5)
     from cobevglue.experiments.observed_sequence import ObservedSequence
 
@@ -76,10 +76,10 @@ def test_pose_errors_are_those_of_the_noise(settings: StudySettings) -> None:
     claimed = noise.apply(sequence.frames, 1, "1", (settings.seed, 0)).claimed
     believed = SE2.from_matrix(np.linalg.inv(claimed["1"]) @ claimed["2"])
     true = SE2.from_matrix(np.linalg.inv(world_SE3_lidar(1, 1)) @ world_SE3_lidar(2, 1))
-    (heard,) = result.conditions[noisy.key].frames[1].heard
-    assert (heard.translation_error, heard.yaw_error) == pytest.approx(believed.error_to(true), abs=1e-6)
-    assert heard.agent == "2"
-    assert heard.accepted
+    (received,) = result.conditions[noisy.key].frames[1].received
+    assert (received.translation_error, received.yaw_error) == pytest.approx(believed.error_to(true), abs=1e-6)
+    assert received.agent == "2"
+    assert received.accepted
 
 
 def test_ground_truth_is_union_with_all_points(settings: StudySettings) -> None:
@@ -94,9 +94,9 @@ def test_ground_truth_is_union_with_all_points(settings: StudySettings) -> None:
 
 def test_late_agent_takes_part_from_arrival(settings: StudySettings) -> None:
     result = run(settings, [OURS, CLEAN], number=1)
-    heard = [[one.agent for one in frame.heard] for frame in result.conditions[CLEAN.key].frames.values()]
-    assert heard == [["2"], ["2", "3"], ["2", "3"]]
-    assert [list(truth.co_visible) for truth in result.truth] == heard
+    received = [[one.agent for one in frame.received] for frame in result.conditions[CLEAN.key].frames.values()]
+    assert received == [["2"], ["2", "3"], ["2", "3"]]
+    assert [list(truth.co_visible) for truth in result.truth] == received
 
 
 def test_agents_come_and_go_and_egoless_frames_drop(tiny: Path, tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_agents_come_and_go_and_egoless_frames_drop(tiny: Path, tmp_path: Path) 
     result = run(settings, [OURS, CLEAN])
     assert result.left_out == {"agents without a cloud": 5, "frames without the ego": 1}
     frames = result.conditions[OURS.key].frames
-    assert [[one.agent for one in frame.heard] for frame in frames.values()] == [["2"], ["2"], [], ["2"]]
+    assert [[one.agent for one in frame.received] for frame in frames.values()] == [["2"], ["2"], [], ["2"]]
 
 
 def test_a_roadside_unit_is_never_the_ego(tiny: Path, tmp_path: Path) -> None:
@@ -119,16 +119,16 @@ def test_a_roadside_unit_is_never_the_ego(tiny: Path, tmp_path: Path) -> None:
     write_agent(folder, 2, range(2), name="7")
     result = run(tiny_settings(tiny, dataset="v2xset", root=str(tmp_path / "data")), [CLEAN])
     assert result.ego == "7"
-    assert result.conditions[CLEAN.key].frames[0].heard[0].agent == "-1"
-    alone = tmp_path / "alone" / "test" / "sequence"
+    assert result.conditions[CLEAN.key].frames[0].received[0].agent == "-1"
+    alone = tmp_path / "alone" / "test" / "drive"
     write_agent(alone, 1, range(2), name="-1")
-    nobody = run(tiny_settings(tiny, dataset="v2xset", root=str(tmp_path / "alone")), [CLEAN])
-    assert (nobody.ego, nobody.truth) == ("", [])
-    assert nobody.left_out == {"frames without the ego": 2}
+    empty = run(tiny_settings(tiny, dataset="v2xset", root=str(tmp_path / "alone")), [CLEAN])
+    assert (empty.ego, empty.truth) == ("", [])
+    assert empty.left_out == {"frames without the ego": 2}
 
 
-def test_one_agent_alone_sees_what_it_sees(tiny: Path, tmp_path: Path) -> None:
-    write_agent(tmp_path / "data" / "test" / "sequence", 1, range(2))
+def test_a_single_agent_detects_alike_in_all_conditions(tiny: Path, tmp_path: Path) -> None:
+    write_agent(tmp_path / "data" / "test" / "drive", 1, range(2))
     result = run(tiny_settings(tiny, root=str(tmp_path / "data")), [ALONE, OURS, CLEAN])
     alone, ours, clean = (numbers(one) for one in result.conditions.values())
     assert alone == ours == clean
@@ -162,8 +162,8 @@ def test_long_sequence_is_independent_of_blocks(tiny: Path, tmp_path: Path, monk
     blocks = run(settings, [OURS, late, old])
     for key in whole.conditions:
         assert numbers(blocks.conditions[key]) == numbers(whole.conditions[key])
-    assert not whole.conditions[late.key].frames[2].heard
-    assert whole.conditions[late.key].frames[3].heard
+    assert not whole.conditions[late.key].frames[2].received
+    assert whole.conditions[late.key].frames[3].received
 
 
 def test_work_is_reported_as_it_is_estimated(settings: StudySettings) -> None:
@@ -221,21 +221,21 @@ def test_evaluation_range_is_whole_metres_inside_detector(settings: StudySetting
         ({"fusion": "none", "aligner": "given", "evry": 2}, "has no setting 'evry'; did you mean 'every'"),
     ],
 )
-def test_what_cannot_be_run_is_refused_before(values: dict[str, object], message: str) -> None:
+def test_invalid_conditions_are_refused(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Condition.model_validate(values)
 
 
 def test_refused_poses_have_infinite_errors(settings: StudySettings) -> None:
     result = run(settings, [OURS])
-    heard = [one for frame in result.conditions[OURS.key].frames.values() for one in frame.heard]
-    assert heard
-    for one in heard:
+    received = [one for frame in result.conditions[OURS.key].frames.values() for one in frame.received]
+    assert received
+    for one in received:
         assert one.accepted == math.isfinite(one.translation_error) == (one.reason == "")
         assert one.alignment_bytes == one.message_bytes["boxes"]
 
 
-def test_boxes_are_kept_without_what_nobody_looks_at(settings: StudySettings) -> None:
+def test_boxes_are_stored_without_labels_and_tracks(settings: StudySettings) -> None:
     boxes = run(settings, [ALONE]).conditions[ALONE.key].frames[0].boxes
     assert isinstance(boxes, Boxes)
     assert boxes.track_id is None

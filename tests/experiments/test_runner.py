@@ -27,7 +27,7 @@ CONDITIONS = [
 def numbers(results: list[ScenarioResult]) -> list[object]:
     """Everything but the times."""
     return [
-        (sequence.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.heard)
+        (sequence.scenario, key, index, frame.boxes.center.tolist(), frame.boxes.yaw.tolist(), frame.received)
         for sequence in results
         for key, run in sorted(sequence.conditions.items())
         for index, frame in run.frames.items()

@@ -1,4 +1,4 @@
-"""A detector that is made in no time and sequences that are gone through in no time, in OPV2V's format."""
+"""A tiny detector and short sequences in OPV2V's format, for fast tests."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CARS = Boxes(
 
 
 def tiny_detector(folder: Path) -> Path:
-    """A file with a detector that knows nothing, but finds something."""
+    """A file with an untrained detector, which returns some boxes."""
     torch.manual_seed(3)
     path = folder / "tiny.safetensors"
     detector = PointPillars(TINY)
@@ -48,7 +48,7 @@ def tiny_detector(folder: Path) -> Path:
 
 
 def world_SE3_lidar(agent: int, frame: int) -> FloatArray:
-    """Agents drive slowly, side by side, each another way."""
+    """Agents drive slowly, side by side, with different headings."""
     yaw = 0.3 * agent
     matrix = np.eye(4)
     matrix[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -80,7 +80,7 @@ def write_agent(
 
 
 def tiny_tree(root: Path, frames: int = 3) -> Path:
-    """A data set with the split "test": a sequence of two agents, and one with three, of whom one comes late."""
+    """A data set with the split "test": a sequence of two agents, and one of three, one of which arrives late."""
     for agent in (1, 2):
         write_agent(root / "test" / "a_pair", agent, range(frames))
     for agent in (1, 2):

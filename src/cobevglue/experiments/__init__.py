@@ -1,1 +1,1 @@
-"""The paper's tables and figures on any data set: conditions, runs over sequences, tables of results."""
+"""The paper's tables and figures on any data set: conditions, their runs on sequences, and tables of the results."""

@@ -1,4 +1,4 @@
-"""One way to run the system over the sequences of a study: a fusion method, a source of poses, and what goes wrong."""
+"""A condition of a study: a fusion method, a source of poses and a disturbance."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = ["Condition"]
 
 
 class Condition(Settings):
-    """How the system is run. Equal conditions have equal keys, whatever process made them.
+    """How the system is run. Equal conditions have equal keys in all processes.
 
     Attributes:
         fusion: name of the fusion method.
         aligner: name of the source of poses.
         aligner_options: its arguments; of "bevglue", fields of `BEVGlueConfig`.
-        disturbance: name of what goes wrong.
+        disturbance: name of the disturbance.
         disturbance_options: its settings.
-        true_poses: aligners that need poses are given the true ones, whatever agents claim: the oracle.
-        forget: the aligner forgets everything after each frame.
-        every: only every so many frames are run.
+        true_poses: aligners that need poses use the true ones instead of the claimed ones: the oracle.
+        forget: the aligner is reset before each frame.
+        every: step between the frames that are run.
 
     Raises:
         ValueError: no such aligner, disturbance or option (names the nearest), or a value out of its range.
@@ -42,16 +42,16 @@ class Condition(Settings):
     every: Annotated[int, Field(ge=1)] = 1
 
     def model_post_init(self, _: Any) -> None:
-        """Refuse what could not be run, before anything is."""
+        """Check that the condition can be run."""
         if self.aligner not in ALIGNERS:
             raise ValueError(f"no aligner {did_you_mean(self.aligner, ALIGNERS)}")
         self.make_disturbance()
 
     @property
     def key(self) -> str:
-        """All of it as one line of JSON."""
+        """All fields as one line of JSON."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
 
     def make_disturbance(self) -> Disturbance:
-        """What goes wrong."""
+        """The disturbance of this condition."""
         return disturbance(self.disturbance, **self.disturbance_options)

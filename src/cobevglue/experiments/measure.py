@@ -1,4 +1,4 @@
-"""Metrics of a study: average precision, poses, bytes and times of a condition over all sequences."""
+"""Metrics of a study: average precision, pose errors, bytes and times of a condition over all sequences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cobevglue.experiments.results import FrameResult, FrameTruth, ReceivedPose,
 __all__ = ["IOUS", "PoseQuality", "Results", "pose_quality"]
 
 IOUS = (0.3, 0.5, 0.7)
-"""IoU thresholds of true positives."""
+"""IoU thresholds of a true detection."""
 
 
 @dataclass(eq=False)
@@ -25,8 +25,8 @@ class Results:
     """The results of a study.
 
     Attributes:
-        sequences: results of each sequence.
-        evaluation_range: x_min, x_max, y_min, y_max [m] of evaluated objects.
+        sequences: the results of each sequence.
+        evaluation_range: x_min, x_max, y_min, y_max [m].
         min_points: objects with fewer points are ignored.
     """
 
@@ -40,12 +40,12 @@ class Results:
         return all(condition.key in sequence.conditions for sequence in self.sequences)
 
     def ap(self, condition: Condition, iou: float, every: int = 1) -> float:
-        """Average precision, in [0, 1]; NaN without evaluated objects.
+        """Average precision, in [0, 1]; NaN without any evaluated object.
 
         Args:
             condition: one that was run.
             iou: one of `IOUS`.
-            every: use every n-th frame only; a multiple of the condition's own interval.
+            every: step between the frames that are used; a multiple of the condition's.
         """
         key = condition.key, every
         if key not in self._precision:
@@ -63,33 +63,34 @@ class Results:
         return self._precision[key][iou]
 
     def frames(self, condition: Condition, every: int = 1) -> Iterator[tuple[FrameTruth, FrameResult]]:
-        """The evaluated frames of all sequences in order, with their ground truth."""
+        """Ground truth and result of each frame that was run, sequence by sequence."""
         for sequence in self.sequences:
             for index, frame in sequence.conditions[condition.key].frames.items():
                 if index % every == 0:
                     yield sequence.truth[index], frame
 
-    def heard(self, condition: Condition, every: int = 1) -> Iterator[tuple[int, ReceivedPose]]:
-        """(number of objects detected by both, collaborator) for every collaborator in every frame."""
+    def received_poses(self, condition: Condition, every: int = 1) -> Iterator[tuple[int, ReceivedPose]]:
+        """For each collaborator and frame, the number of objects that both it and the ego detected, and its pose."""
         for truth, frame in self.frames(condition, every):
-            for one in frame.heard:
-                yield truth.co_visible.get(one.agent, 0), one
+            for pose in frame.received:
+                yield truth.co_visible.get(pose.agent, 0), pose
 
     def payload_bytes(self, condition: Condition) -> float:
-        """Mean bytes that a collaborator sends for fusion in a frame; NaN without any."""
-        return _mean([sum(one.message_bytes.values()) - one.alignment_bytes for _, one in self.heard(condition)])
+        """Mean bytes for fusion that one collaborator sends in one frame; NaN without any."""
+        poses = [pose for _, pose in self.received_poses(condition)]
+        return _mean([sum(pose.message_bytes.values()) - pose.alignment_bytes for pose in poses])
 
     def alignment_bytes(self, condition: Condition, every: int = 1) -> float:
-        """Mean bytes that a collaborator sends for alignment in a frame; NaN without any."""
-        return _mean([one.alignment_bytes for _, one in self.heard(condition, every)])
+        """Mean bytes for alignment that one collaborator sends in one frame; NaN without any."""
+        return _mean([pose.alignment_bytes for _, pose in self.received_poses(condition, every)])
 
     def milliseconds(self, condition: Condition) -> dict[str, float]:
-        """Median time of each stage of a frame, all collaborators together [ms]."""
+        """Median time of each stage for one frame with all collaborators [ms]."""
         frames = [frame.seconds for _, frame in self.frames(condition)]
         return {stage: 1e3 * float(np.median([one[stage] for one in frames])) for stage in (frames or [{}])[0]}
 
     def perception_milliseconds(self) -> dict[str, float]:
-        """Median time of each stage of perception for one cloud [ms]."""
+        """Median time of each perception stage for one cloud [ms]."""
         frames = [
             {stage: seconds / (1 + len(truth.co_visible)) for stage, seconds in truth.seconds.items()}
             for sequence in self.sequences
@@ -99,17 +100,17 @@ class Results:
 
     @property
     def frame_count(self) -> int:
-        """Number of evaluated frames."""
+        """Number of frames used."""
         return sum(len(sequence.truth) for sequence in self.sequences)
 
     @property
-    def lonely_frames(self) -> int:
-        """Frames without any collaborator."""
+    def frames_without_collaborators(self) -> int:
+        """Number of frames without any collaborator."""
         return sum(not truth.co_visible for sequence in self.sequences for truth in sequence.truth)
 
     @property
     def left_out(self) -> Counter[str]:
-        """Reasons for skipped data, with counts."""
+        """Reasons for skipping, with their counts."""
         total: Counter[str] = Counter()
         for sequence in self.sequences:
             total.update(sequence.left_out)
@@ -127,15 +128,15 @@ class Results:
 
 @dataclass(frozen=True, slots=True)
 class PoseQuality:
-    """Shares of all collaborators in all frames; NaN where there are none to divide by.
+    """Pose quality over all collaborators and frames; NaN where the denominator is 0.
 
     Attributes:
-        count: number of collaborators.
-        refused: share without a pose.
-        success_1, success_2, success_3: share with a pose within k m and k degrees.
-        wrong: share of the accepted ones that are off by more than 3 m or 3 degrees.
-        translation: median error of the accepted ones [m].
-        yaw: median error of the accepted ones [degrees].
+        count: number of received poses, refused ones included.
+        refused: share of refused poses.
+        success_1, success_2, success_3: share with errors below k m and k degrees.
+        wrong: share of the accepted ones with an error of 3 m or 3 degrees or more.
+        translation: median translation error of the accepted ones [m].
+        yaw: median yaw error of the accepted ones [degrees].
     """
 
     count: int
@@ -148,18 +149,18 @@ class PoseQuality:
     yaw: float
 
 
-def pose_quality(heard: Sequence[ReceivedPose]) -> PoseQuality:
-    """Success rates and errors of these collaborators' poses."""
-    accepted = [one for one in heard if one.accepted]
+def pose_quality(poses: Sequence[ReceivedPose]) -> PoseQuality:
+    """The quality of these poses."""
+    accepted = [pose for pose in poses if pose.accepted]
     return PoseQuality(
-        count=len(heard),
-        refused=_mean([not one.accepted for one in heard]),
-        success_1=_mean([one.success(1.0) for one in heard]),
-        success_2=_mean([one.success(2.0) for one in heard]),
-        success_3=_mean([one.success(3.0) for one in heard]),
-        wrong=_mean([not one.success(3.0) for one in accepted]),
-        translation=float(np.median([one.translation_error for one in accepted])) if accepted else math.nan,
-        yaw=math.degrees(np.median([one.yaw_error for one in accepted])) if accepted else math.nan,
+        count=len(poses),
+        refused=_mean([not pose.accepted for pose in poses]),
+        success_1=_mean([pose.success(1.0) for pose in poses]),
+        success_2=_mean([pose.success(2.0) for pose in poses]),
+        success_3=_mean([pose.success(3.0) for pose in poses]),
+        wrong=_mean([not pose.success(3.0) for pose in accepted]),
+        translation=float(np.median([pose.translation_error for pose in accepted])) if accepted else math.nan,
+        yaw=math.degrees(np.median([pose.yaw_error for pose in accepted])) if accepted else math.nan,
     )
 
 

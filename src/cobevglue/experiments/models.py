@@ -1,4 +1,4 @@
-"""The networks of a study, made once in each process."""
+"""The networks of a study, built once per process."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from cobevglue.torch_device import chosen_device
 __all__ = ["Models"]
 
 _WITH_NETWORK = {"v2vnet-robust"}
-"""Aligners that are half of the fusion method of the same name: they use its network."""
+"""Aligners that use the network of the fusion method of the same name."""
 
 
 class Models:
     """The detector and the fusion methods of a study.
 
     Args:
-        settings: which ones.
+        settings: of the study.
 
     Attributes:
         detector: in evaluation mode, on a GPU where there is one.
@@ -45,7 +45,7 @@ class Models:
 
     @property
     def evaluation_range(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max [m] of what counts: whole metres, a pillar inside of what the detector sees."""
+        """x_min, x_max, y_min, y_max [m]: the detector's range less one pillar, in whole metres."""
         config = self.detector.config
         inside = 1e-6 - config.pillar
         (x_min, x_max), (y_min, y_max) = config.x_range, config.y_range
@@ -74,7 +74,7 @@ class Models:
         settings = self._settings
         if not settings.untrained and settings.weights is None:
             return pretrained_fusion(name, self.detector, settings.detector)
-        with torch.random.fork_rng(devices=[]):  # what is not trained is the same in all processes
+        with torch.random.fork_rng(devices=[]):  # untrained weights are the same in all processes
             torch.manual_seed(settings.seed)
             method = fusion_class(name)(self.detector)
         if isinstance(method, IntermediateFusion) and settings.weights is not None:
@@ -82,11 +82,11 @@ class Models:
         return method
 
     def aligner(self, condition: Condition) -> GroupAligner:
-        """The aligner of a condition, which has seen nothing yet; one with a network gets that of this study.
+        """A new aligner for a condition; one with a network uses that of this study.
 
         Raises:
             ValueError: it does not take the condition's options.
-            ModuleNotFoundError: what it needs is not installed.
+            ModuleNotFoundError: a required package is not installed.
         """
         if condition.aligner in _WITH_NETWORK:
             network = self.method(condition.aligner)
@@ -96,7 +96,7 @@ class Models:
         return group_aligner(condition.aligner, **condition.aligner_options)
 
     def fingerprint(self, condition: Condition) -> str:
-        """Of the weights that a condition is run with: changes when they do, and with them what comes out."""
+        """Fingerprint of the weights that a condition uses; it changes with them."""
         names = [condition.fusion, *({condition.aligner} & _WITH_NETWORK - {condition.fusion})]
         return "-".join(self._fingerprint_of(name) for name in names)
 
@@ -108,5 +108,5 @@ class Models:
 
     @property
     def detector_fingerprint(self) -> str:
-        """The same of the detector."""
+        """Fingerprint of the detector's weights."""
         return fingerprint(self.detector)

@@ -82,12 +82,12 @@ class ObservedSequence:
         except FileNotFoundError:
             self.left_out["frames without a label or calibration file"] += 1
             return
-        seen = {}
+        observed = {}
         for name, points in clouds.items():
             perception = self._perception.setdefault(name, Perception(self.detector))
-            seen[name] = perception.step(points, frame.time)
-        self.frames.append(ObservedFrame(frame.time, seen, poses, poses))
-        self.truth.append(_truth(frame.timestamp, objects, self.ego, agents, seen))
+            observed[name] = perception.step(points, frame.time)
+        self.frames.append(ObservedFrame(frame.time, observed, poses, poses))
+        self.truth.append(_truth(frame.timestamp, objects, self.ego, agents, observed))
 
     def _clouds(self, frame: Frame) -> Iterator[tuple[str, Float32Array]]:
         for name, agent in frame.agents.items():
@@ -103,24 +103,24 @@ def _truth(
     objects: Boxes,
     ego: str,
     agents: Mapping[str, AgentFrame],
-    seen: Mapping[str, PerceptionOutput],
+    observed: Mapping[str, PerceptionOutput],
 ) -> FrameTruth:
     points = np.zeros(len(objects), np.int64)
     detected: dict[str, BoolArray] = {}
     for name, agent in agents.items():
         agent_SE3_ego = inverse_SE3(agent.world_SE3_lidar) @ agents[ego].world_SE3_lidar
         there = transform_boxes(objects, agent_SE3_ego)
-        raised = there.replace(center=there.center + (0.0, 0.0, seen[name].height_correction))
-        points += count_points(seen[name].points, raised)
-        detected[name] = _detected(there, seen[name].boxes)
+        raised = there.replace(center=there.center + (0.0, 0.0, observed[name].height_correction))
+        points += count_points(observed[name].points, raised)
+        detected[name] = _detected(there, observed[name].boxes)
     co_visible = {name: int((detected[ego] & rows).sum()) for name, rows in detected.items() if name != ego}
     seconds = Counter[str]()
-    for view in seen.values():
-        seconds.update(view.seconds)
+    for output in observed.values():
+        seconds.update(output.seconds)
     return FrameTruth(timestamp, objects.replace(track_id=None), points, co_visible, dict(seconds))
 
 
 def _detected(objects: Boxes, boxes: Boxes) -> BoolArray:
-    """(N,) whether there is a box of each object."""
+    """(N,) whether each object was detected."""
     found: BoolArray = np.any(bev_iou(objects, boxes) > _DETECTED_IOU, axis=1)
     return found

@@ -1,4 +1,4 @@
-"""The figures of a report: curves over noise and bytes, and the detections of methods in one frame."""
+"""The figures of a report: curves over noise and bytes, and detections in one frame."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _SHOWN = ("v2x-vit", "coalign", "cobevglue")
 _NOISE = 3.0
 """The noise of that figure [m, degrees]."""
 _FRAMES = 10
-"""Number of frames that are processed; the last one is shown."""
+"""Number of frames of the sequence that are run; the last one is shown."""
 _SCORE = 0.3
-"""Minimum score of shown detections."""
+"""Detections with lower scores are not shown."""
 
 
 def noise_pictures(scope: Scope, results: Results) -> list[Picture]:
@@ -52,21 +52,21 @@ def noise_pictures(scope: Scope, results: Results) -> list[Picture]:
 
 
 def registration_pictures(scope: Scope, results: Results) -> list[Picture]:
-    """Average precision over communication."""
+    """Average precision over bytes for alignment."""
     from cobevglue.visualization.study_figures import ap_over_bytes
 
-    title = "AP@0.5 over what is sent for alignment"
+    title = "AP@0.5 over bytes sent for alignment"
     return [(title, ap_over_bytes(registration_points(scope, results, 0.5), title))]
 
 
 def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> list[Picture]:
-    """One frame of the first sequence with collaborators: the paper's Figures 5 and 6.
+    """One frame of the first sequence with a collaborator: the paper's Figures 5 and 6.
 
-    The detections of methods under noise, and the clouds and boxes as aligned by point registration and BEVGlue.
+    They show detections under noise, clouds aligned by point registration, and objects matched by BEVGlue.
     """
     from cobevglue.visualization.study_figures import detections_picture, matching_picture
 
-    sequence = _sequence_with_collaborators(settings, models)
+    sequence = _first_collaborative_sequence(settings, models)
     if sequence is None:
         return []
     ego, frame, truth = sequence.ego, sequence.frames[-1], sequence.truth[-1]
@@ -86,21 +86,21 @@ def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> lis
             condition = as_is(ours, 0.0, aligner, aligner_options={"budget_bytes": scope.budgets[-1]})
             out = _run(condition, sequence, models, settings.seed, last_only=True)
             title = f"{aligner_title(aligner)} on {scope.budgets[-1]:,} bytes of points"
-            caption = f"{title}: all clouds where it puts them, true boxes in green. {_errors(frame, ego, out)}."
+            caption = f"{title}: all clouds aligned by its poses, true boxes in green. {_errors(frame, ego, out)}."
             clouds = _clouds(frame, ego, {name: one.ego_SE2_other for name, one in out.alignments.items()})
             pictures.append((caption, detections_picture(clouds, objects, Boxes.empty(), title)))
     out = _run(as_is(ours), sequence, models, settings.seed)
     for other, alignment in out.alignments.items():
         sent = out.alignment_bytes[other]
-        caption = f"BEVGlue on {sent:,} bytes of boxes, those that match joined. {_errors(frame, ego, out, other)}."
+        caption = f"BEVGlue on {sent:,} bytes of boxes, matched ones joined. {_errors(frame, ego, out, other)}."
         pictures.append(
             (caption, matching_picture(frame.observations[ego].boxes, frame.observations[other].boxes, alignment))
         )
     return pictures
 
 
-def _sequence_with_collaborators(settings: StudySettings, models: Models) -> ObservedSequence | None:
-    """The first sequence with collaborators in the shown frame, processed up to it."""
+def _first_collaborative_sequence(settings: StudySettings, models: Models) -> ObservedSequence | None:
+    """The first sequence with collaborators in the shown frame, observed up to this frame."""
     for number in range(len(sequence_names(settings))):
         sequence = ObservedSequence(models.detector)
         sequence.observe(islice(sequence_frames(settings, open_sequence(settings, number)), _FRAMES))
@@ -112,7 +112,7 @@ def _sequence_with_collaborators(settings: StudySettings, models: Models) -> Obs
 def _run(
     condition: Condition, sequence: ObservedSequence, models: Models, seed: int, last_only: bool = False
 ) -> StepOutput:
-    """The ego's result in the last frame; trackers and aligners have processed those before."""
+    """The output for the last frame; unless `last_only`, all frames before it are run, too."""
     system = CoBEVGlue(models.detector, models.method(condition.fusion), models.aligner(condition))
     disturbance = condition.make_disturbance()
     last = len(sequence.frames) - 1
@@ -123,13 +123,13 @@ def _run(
 
 
 def _true_poses(frame: ObservedFrame, ego: str) -> dict[str, SE2]:
-    """The true poses of all collaborators in the ego frame."""
+    """True poses of all collaborators in the ego's frame."""
     ego_SE3_world = inverse_SE3(frame.true[ego])
     return {other: SE2.from_matrix(ego_SE3_world @ frame.true[other]) for other in frame.collaborators(ego)}
 
 
 def _clouds(frame: ObservedFrame, ego: str, poses: Mapping[str, SE2 | None]) -> list[FloatArray]:
-    """The ego's points, and those of the others transformed by these poses; without a pose they are left out."""
+    """The ego's points and those of the others, transformed by these poses; agents without a pose are left out."""
     clouds = [frame.observations[ego].points[:, :3].astype(np.float64)]
     for other, ego_SE2_other in poses.items():
         if ego_SE2_other is not None:
@@ -147,7 +147,7 @@ def _errors(frame: ObservedFrame, ego: str, out: StepOutput, only: str = "") -> 
                 parts.append(f"{other}: refused, {out.alignments[other].reason}")
             else:
                 shift, turn = pose.error_to(truth)
-                parts.append(f"{other}: off by {shift:.2f} m, {math.degrees(turn):.2f}°")
+                parts.append(f"{other}: error {shift:.2f} m, {math.degrees(turn):.2f}°")
     return "; ".join(parts)
 
 

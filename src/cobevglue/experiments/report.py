@@ -26,8 +26,8 @@ class Part:
 
     Attributes:
         settings: its data and networks.
-        results: what came out.
-        pictures: figures by the name of the experiment that they belong to; under "" those of no table.
+        results: of all its conditions.
+        pictures: figures by the name of the experiment that they belong to; "" for those without a table.
     """
 
     settings: StudySettings
@@ -41,9 +41,9 @@ def write_report(
     """Write `index.html`, `report.md` and a folder of CSV files for each data set.
 
     Args:
-        folder: where to; made if it is not there.
-        experiments: what is reported, in order.
-        scope: what was run.
+        folder: of the report; created if missing.
+        experiments: to report, in order.
+        scope: the conditions that were run.
         parts: the data sets.
         about: command, versions, machine and date, a line each. Absolute paths in them become relative.
 
@@ -74,18 +74,18 @@ def write_report(
 
 
 def _data(part: Part) -> list[str]:
-    """What the numbers are of."""
+    """The data behind the numbers: frames, evaluated objects, skipped data."""
     results, settings = part.results, part.settings
     x_min, x_max, y_min, y_max = results.evaluation_range
     counts = (
         f"{settings.label}: {results.frame_count} frames of {len(results.sequences)} sequences, "
-        f"{results.object_count} objects that count: with {settings.min_points} points or more of all agents together, "
+        f"{results.object_count} evaluated objects: with {settings.min_points} points or more of all agents together, "
         f"within x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} m of the ego's LiDAR. All detections are sorted "
         "by score together (global AP)."
     )
     left_out = [f"{count} {what}" for what, count in sorted(results.left_out.items())]
-    if results.lonely_frames:
-        left_out.append(f"{results.lonely_frames} frames in which the ego is alone (used)")
+    if results.frames_without_collaborators:
+        left_out.append(f"{results.frames_without_collaborators} frames in which the ego is alone (used)")
     if settings.untrained:
         left_out.append("fusion methods without any training of their own: not what their papers measure")
     return [counts, *([f"{settings.label}: {'; '.join(left_out)}."] if left_out else [])]

@@ -1,4 +1,4 @@
-"""The whole study: run what is missing, draw, write the report."""
+"""The whole study: run missing conditions, draw figures, write the report."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ def reproduce(
 
     Args:
         studies: the data sets and networks.
-        experiments: the tables that are asked for.
-        scope: how many conditions there are.
-        folder: for the report, and for the results of each sequence, with which an interrupted run goes on.
+        experiments: the requested tables.
+        scope: range of the conditions.
+        folder: of the report and of the results of each sequence, from which an interrupted run resumes.
         about: lines on the report's first page.
-        workers: processes.
+        workers: number of processes.
         use_ray: run on a Ray cluster; see `run_study`.
-        progress: called with the name of the data, the work that is done, and all there is.
+        progress: called with the name of the data, the finished work and the total work.
 
     Returns:
         The tables of each data set by its name, and the summary under "".
 
     Raises:
-        ValueError: bad settings or data, see `run_study`; or two studies are called the same.
-        FileNotFoundError: data or weights are not there.
-        ModuleNotFoundError: something is not installed.
+        ValueError: bad settings or data, see `run_study`; or two studies have the same label.
+        FileNotFoundError: data or weights are missing.
+        ModuleNotFoundError: a required package is not installed.
     """
     labels = [settings.label for settings in studies]
     if len(set(labels)) < len(labels):
         raise ValueError(f"the same data twice: {', '.join(labels)}")
     for settings in studies:
-        sequence_names(settings)  # what is not there is said before hours of work
+        sequence_names(settings)  # missing data is an error before hours of work
     conditions = conditions_of(experiments, scope)
     parts = []
     for settings in studies:
@@ -61,8 +61,8 @@ def reproduce(
         def show(done: float, total: float, label: str = settings.label) -> None:
             progress(label, done, total)
 
-        sequences = Path(folder) / settings.label.replace(" ", "_") / "sequences"
-        runs = run_study(settings, conditions, sequences, workers=workers, use_ray=use_ray, progress=show)
+        sequence_folder = Path(folder) / settings.label.replace(" ", "_") / "drives"
+        runs = run_study(settings, conditions, sequence_folder, workers=workers, use_ray=use_ray, progress=show)
         results = Results(runs, models.evaluation_range, settings.min_points)
         if not results.frame_count:
             left_out = ", ".join(f"{count} {what}" for what, count in sorted(results.left_out.items()))

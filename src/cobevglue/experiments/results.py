@@ -1,8 +1,8 @@
-"""Results of one sequence under several conditions, in memory and on disk.
+"""Results of one sequence under some conditions, in memory and on disk.
 
-A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with everything but boxes; `boxes`, the
+A file is an `.npz` with three arrays: `document`, the bytes of a JSON document with all but the boxes; `boxes`, the
 (M, 8) detections x, y, z, l, w, h [m], yaw [rad], score of all conditions and frames in the document's order; and
-`truth`, the (K, 7) true boxes of all frames. It is written as a whole, and nothing in it is code.
+`truth`, the (K, 7) true boxes of all frames. It is written atomically and contains no pickled objects.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class ReceivedPose:
         agent: its name.
         translation_error: of its pose [m]; infinite where it was refused.
         yaw_error: of its pose, magnitude [rad]; infinite where it was refused.
-        landing_error: how far its boxes lie from where the true pose puts them [m]; infinite where it was refused.
+        landing_error: distance of its boxes from their places by the true pose [m]; infinite where it was refused.
         reason: why its pose was refused; "" where it was accepted.
-        message_bytes: size of its messages by kind.
-        alignment_bytes: the part of it that was sent for alignment.
+        message_bytes: bytes sent, by kind of message.
+        alignment_bytes: bytes of these for alignment.
     """
 
     agent: str
@@ -69,23 +69,29 @@ class ReceivedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """The ego's result in one frame: boxes with scores in its LiDAR frame, collaborators, and times [s] by stage."""
+    """The ego's output in one frame.
+
+    Attributes:
+        boxes: detections with scores, in the ego's LiDAR frame.
+        received: the pose of each collaborator.
+        seconds: time of each stage [s].
+    """
 
     boxes: Boxes
-    heard: tuple[ReceivedPose, ...]
+    received: tuple[ReceivedPose, ...]
     seconds: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """The ground truth of one frame.
+    """Ground truth of one frame.
 
     Attributes:
         timestamp: name of the frame.
-        objects: K vehicles that any agent could see, in the ego's LiDAR frame.
+        objects: K vehicles labelled by any agent, in the ego's LiDAR frame.
         point_count: (K,) points of all agents together on each of them.
-        co_visible: by collaborator, the number of objects that both it and the ego detected.
-        seconds: of perception's stages, summed over agents [s].
+        co_visible: by collaborator, number of objects that both it and the ego detected.
+        seconds: time of each perception stage, summed over agents [s].
     """
 
     timestamp: str
@@ -100,9 +106,9 @@ class ConditionResult:
     """A sequence under one condition.
 
     Attributes:
-        condition: the condition.
+        condition: settings of the run.
         fingerprint: of the method's weights.
-        frames: by the number of the frame in the result's truth.
+        frames: by frame index in `ScenarioResult.truth`.
     """
 
     condition: Condition
@@ -117,8 +123,8 @@ class ScenarioResult:
     Attributes:
         scenario: name of the sequence.
         ego: name of the ego; "" where no frame had a vehicle with a cloud.
-        truth: ground truth of every evaluated frame.
-        left_out: reasons for skipped data with counts: "agents without a cloud", "frames without the ego".
+        truth: of each frame used.
+        left_out: reasons for skipping, with their counts: "agents without a cloud", "frames without the ego".
         conditions: by their keys.
     """
 
@@ -130,7 +136,7 @@ class ScenarioResult:
 
 
 def write_result(path: Path, result: ScenarioResult) -> None:
-    """Write the file; it appears complete or not at all."""
+    """Write the file atomically."""
     truth = [
         {
             "timestamp": one.timestamp,
@@ -150,7 +156,7 @@ def write_result(path: Path, result: ScenarioResult) -> None:
                 {
                     "frame": index,
                     "boxes": len(frame.boxes),
-                    "heard": [_finite(asdict(heard)) for heard in frame.heard],
+                    "heard": [_finite(asdict(pose)) for pose in frame.received],
                     "seconds": frame.seconds,
                 }
                 for index, frame in run.frames.items()
@@ -177,10 +183,10 @@ def write_result(path: Path, result: ScenarioResult) -> None:
 
 
 def read_result(path: Path) -> ScenarioResult:
-    """Read what `write_result` wrote.
+    """Read a file of `write_result`.
 
     Raises:
-        ValueError: the file is damaged, or of something else; names it.
+        ValueError: the file is damaged or not a result; names it.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -190,7 +196,7 @@ def read_result(path: Path) -> ScenarioResult:
             raise ValueError(f"format {document['format']}, this version of cobevglue reads format {_FORMAT}")
         return _result(document, boxes, truth)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: damaged, or no result of a sequence: {error}") from None
+        raise ValueError(f"{path}: damaged, or not the result of a sequence: {error}") from None
 
 
 def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -> ScenarioResult:
@@ -204,8 +210,8 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
     for one in document["conditions"]:
         frames = {}
         for frame in one["frames"]:
-            heard = tuple(ReceivedPose(**_infinite(part)) for part in frame["heard"])
-            frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), heard, frame["seconds"])
+            received = tuple(ReceivedPose(**_infinite(part)) for part in frame["heard"])
+            frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), received, frame["seconds"])
             row += frame["boxes"]
         condition = Condition(**one["condition"])
         conditions[condition.key] = ConditionResult(condition, one["fingerprint"], frames)
@@ -213,7 +219,7 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
 
 
 def _rows(parts: Sequence[Boxes], width: int) -> FloatArray:
-    """(M, width) numbers of all boxes."""
+    """(M, width) box parameters of all parts."""
     rows = [np.zeros((0, width))]
     for boxes in parts:
         score = [boxes.score] if boxes.score is not None else [np.zeros(len(boxes))]
@@ -227,7 +233,7 @@ def _boxes(rows: FloatArray, labels: list[str] | None = None) -> Boxes:
 
 
 def _finite(record: dict[str, Any]) -> dict[str, Any]:
-    """Errors of a refused pose are infinite, which JSON does not know: null."""
+    """Infinite errors of refused poses as null: JSON has no infinity."""
     return {k: None if isinstance(v, float) and math.isinf(v) else v for k, v in record.items()}
 
 

@@ -1,4 +1,4 @@
-"""One sequence under many conditions. Perception is run once, and each method's messages are made once."""
+"""Runs one sequence under many conditions. Perception is run once, and each method encodes each message once."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from cobevglue.system import CoBEVGlue, StepOutput
 __all__ = ["PERCEPTION_COST", "MessageMemo", "run_sequence"]
 
 PERCEPTION_COST = 10
-"""Cost of perception relative to one condition of the same frame, for the estimate of the remaining time."""
+"""Cost of perception relative to one condition, both for one frame; for the estimate of the remaining time."""
 _BLOCK = 20
-"""Number of frames in memory, besides as many before them, which disturbances may use."""
+"""Number of frames per block. The current block and the previous one, which disturbances may use, are in memory."""
 
 _Progress = Callable[[float], None]
 
 
 def run_sequence(
     settings: StudySettings,
-    scenario: Scenario,
+    sequence: Scenario,
     number: int,
     conditions: Sequence[Condition],
     models: Models,
@@ -46,22 +46,22 @@ def run_sequence(
 
     Args:
         settings: of the study.
-        scenario: the frames; consecutive.
-        number: of the sequence in the study, for random numbers.
-        conditions: with keys that differ.
+        sequence: consecutive frames.
+        number: index of the sequence in the study; part of the random seed.
+        conditions: with distinct keys.
         models: the networks.
-        progress: called with the completed work, in frames of one condition.
+        progress: called with the work since the last call, in frames of one condition.
 
     Raises:
         ValueError: a broken file; names it.
     """
-    sequence = ObservedSequence(models.detector)
+    observed = ObservedSequence(models.detector)
     memos = {condition.fusion: MessageMemo(models.method(condition.fusion)) for condition in conditions}
     runs = [_Run(condition, models, memos[condition.fusion], (settings.seed, number)) for condition in conditions]
     runs.sort(key=lambda run: list(memos).index(run.condition.fusion))  # so that only one memo is full at a time
-    frames = iter(sequence_frames(settings, scenario))
+    frames = iter(sequence_frames(settings, sequence))
     while block := list(islice(frames, _BLOCK)):
-        new = sequence.observe(block)
+        new = observed.observe(block)
         progress(PERCEPTION_COST * len(block))
         fusion = ""
         for run in runs:
@@ -70,16 +70,16 @@ def run_sequence(
                 for memo in memos.values():
                     memo.clear()
             for index in new:
-                run.step(sequence, index)
+                run.step(observed, index)
             progress(len(block) / run.condition.every)
         for memo in memos.values():
             memo.clear()
-        sequence.drop_observations(before=new.start)
+        observed.drop_observations(before=new.start)
     return ScenarioResult(
-        scenario.name,
-        sequence.ego,
-        sequence.truth,
-        dict(sequence.left_out),
+        sequence.name,
+        observed.ego,
+        observed.truth,
+        dict(observed.left_out),
         {
             run.condition.key: ConditionResult(run.condition, models.fingerprint(run.condition), run.frames)
             for run in runs
@@ -88,7 +88,7 @@ def run_sequence(
 
 
 class _Run:
-    """The state of one condition during a sequence."""
+    """The state of one condition in a sequence."""
 
     def __init__(self, condition: Condition, models: Models, memo: MessageMemo, key: tuple[int, ...]) -> None:
         self.condition = condition
@@ -98,20 +98,19 @@ class _Run:
         self._disturbance: Disturbance = condition.make_disturbance()
         self._key = key
 
-    def step(self, sequence: ObservedSequence, index: int) -> None:
-        """The next frame."""
+    def step(self, observed: ObservedSequence, index: int) -> None:
+        """Run the next frame, frame `index`."""
         if index % self.condition.every:
             return
-        frame = self._disturbance.apply(sequence.frames, index, sequence.ego, self._key)
+        frame = self._disturbance.apply(observed.frames, index, observed.ego, self._key)
         if self.condition.forget:
             self._system.aligner.reset()
         poses = frame.true if self.condition.true_poses else frame.claimed
         self._memo.saved = 0.0
-        out = self._system.collaborate(frame.observations, sequence.ego, frame.time, poses)
+        out = self._system.collaborate(frame.observations, observed.ego, frame.time, poses)
         out.seconds["messages"] += self._memo.saved
-        self.frames[index] = FrameResult(
-            _numbers(out.boxes), tuple(_received_poses(frame, sequence.ego, out)), out.seconds
-        )
+        received = tuple(_received_poses(frame, observed.ego, out))
+        self.frames[index] = FrameResult(_without_labels(out.boxes), received, out.seconds)
 
 
 def _received_poses(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator[ReceivedPose]:
@@ -126,8 +125,8 @@ def _received_poses(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator
         )
 
 
-def _numbers(boxes: Boxes) -> Boxes:
-    """The boxes without the fields that are not stored."""
+def _without_labels(boxes: Boxes) -> Boxes:
+    """The boxes without labels and track ids, which are not stored."""
     return boxes.replace(label=None, track_id=None)
 
 
@@ -135,20 +134,20 @@ class MessageMemo(FusionMethod):
     """A fusion method that caches the message of each observation.
 
     Args:
-        method: the wrapped method.
+        method: the fusion method.
 
     Attributes:
-        saved: time that cached messages had taken [s]; may be set to 0 at any time.
+        saved: time that cached messages took when they were encoded [s]; may be set to 0 at any time.
     """
 
     def __init__(self, method: FusionMethod) -> None:
         self._method = method
-        self.kind = method.kind  # type: ignore[misc]  # as this method has it
+        self.kind = method.kind  # type: ignore[misc]  # of this method
         self.saved = 0.0
         self._made: dict[int, tuple[PerceptionOutput, Arrays, float]] = {}
 
     def clear(self) -> None:
-        """Forget the messages."""
+        """Empty the cache."""
         self._made.clear()
 
     def message(self, observation: PerceptionOutput) -> Arrays:
@@ -159,7 +158,7 @@ class MessageMemo(FusionMethod):
             return message
         start = perf_counter()
         message = self._method.message(observation)
-        self._made[id(observation)] = observation, message, perf_counter() - start  # what is kept keeps its id
+        self._made[id(observation)] = observation, message, perf_counter() - start  # the reference keeps the id valid
         return message
 
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:

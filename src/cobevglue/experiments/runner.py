@@ -1,4 +1,4 @@
-"""Runs a study: a file for each sequence, several processes or a Ray cluster, and an interrupted run goes on."""
+"""Runs a study in several processes or on a Ray cluster. Each sequence has a file, so that interrupted runs resume."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from cobevglue.torch_threads import torch_threads
 __all__ = ["run_study"]
 
 _STUDY_FILE = "study.json"
-_PATIENCE = 0.2  # between two looks at how far the workers are [s]
+_PATIENCE = 0.2  # between progress updates [s]
 
 _Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A sequence, and the conditions that it is still to be run under."""
+    """A sequence and its missing conditions."""
 
     settings: StudySettings
     number: int
@@ -50,17 +50,17 @@ def run_study(
     use_ray: bool = False,
     progress: _Progress = lambda done, total: None,
 ) -> list[ScenarioResult]:
-    """Run every sequence of a study under every condition, or take from `folder` what was run before.
+    """Run every sequence of a study under every condition; results in `folder` are reused.
 
-    The results are the same with any number of workers, but for the times.
+    Except for times, results do not depend on the number of workers.
 
     Args:
         settings: the data and the networks.
-        conditions: any that are equal are run once.
-        folder: where the files are; made if it is not there.
-        workers: processes; with 1 it is done in this one.
+        conditions: equal ones are run once.
+        folder: of the result files; created if missing.
+        workers: number of processes; 1 uses the current one.
         use_ray: run on the Ray cluster that RAY_ADDRESS names, or on one of `workers` processes on this machine.
-        progress: called with the work that is done and that there is in all, in frames of one condition.
+        progress: called with the finished and the total work, in frames of one condition.
 
     Returns:
         The results of all sequences in order.
@@ -97,9 +97,9 @@ def run_study(
 
 
 def _claim(folder: Path, settings: StudySettings, detector: str) -> None:
-    """Make the folder that of this study, or refuse one of another."""
+    """Mark the folder as this study's; refuse the folder of another study."""
     study = {"version": __version__, "detector_weights": detector, **settings.model_dump(mode="json")}
-    # What does not change results: how many sequences there are, and where fusion weights are; those have fingerprints.
+    # The number of sequences and the folder of weights do not change results; weights have fingerprints.
     for name in ("scenarios", "weights", "untrained"):
         del study[name]
     path = folder / _STUDY_FILE
@@ -117,7 +117,7 @@ def _claim(folder: Path, settings: StudySettings, detector: str) -> None:
 
 
 def _only(result: ScenarioResult, fingerprints: Mapping[str, str]) -> ScenarioResult:
-    """The conditions that were asked for."""
+    """The result with the requested conditions only."""
     wanted: dict[str, ConditionResult] = {key: result.conditions[key] for key in fingerprints}
     return replace(result, conditions=wanted)
 
@@ -132,7 +132,7 @@ _Results = Iterator[tuple[_Job, ScenarioResult]]
 def _run_here(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
     """In this process."""
     total, done = _work_of(jobs), 0.0
-    with torch_threads(1):  # sums do not depend on how many there are
+    with torch_threads(1):  # sums do not depend on the number of threads
         for job in jobs:
             finished = [done]
 
@@ -145,8 +145,8 @@ def _run_here(jobs: Sequence[_Job], workers: int, models: Models, progress: _Pro
 
 
 def _run_in_processes(jobs: Sequence[_Job], workers: int, models: Models, progress: _Progress) -> _Results:
-    """In some processes on this machine."""
-    context = get_context("spawn")  # a fork does not get on with threads
+    """In several processes on this machine."""
+    context = get_context("spawn")  # fork is not safe with threads
     reports: Any = context.Queue()
     stop = context.Event()
     total, done = _work_of(jobs), 0.0
@@ -195,7 +195,7 @@ _worker_stop: Any = None
 
 
 def _start_worker(reports: Any, stop: Any) -> None:
-    """In a new process, once."""
+    """Initialise a worker process."""
     global _worker_reports, _worker_stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; the first one stops us
     _worker_reports, _worker_stop = reports, stop
@@ -222,7 +222,7 @@ def _run(job: _Job, models: Models, report: Callable[[float], None]) -> Scenario
 
 
 def _work_of(jobs: Sequence[_Job]) -> float:
-    """Frames of one condition, as far as this is known before the sequences are gone through."""
+    """Estimated work, in frames of one condition."""
     total = 0.0
     for job in jobs:
         frames = len(open_sequence(job.settings, job.number))
@@ -232,7 +232,7 @@ def _work_of(jobs: Sequence[_Job]) -> float:
 
 
 def _drained(reports: Any) -> float:
-    """What workers have done since the last look."""
+    """Work reported by workers since the last call."""
     work = 0.0
     while not reports.empty():
         work += reports.get()
@@ -249,7 +249,7 @@ def _closing(results: Any) -> Iterator[_Results]:
 
 @contextmanager
 def _single_threaded() -> Iterator[None]:
-    """Processes that are started meanwhile compute in one thread each."""
+    """Processes started in this context use one thread each."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))

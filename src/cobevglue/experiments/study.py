@@ -1,4 +1,4 @@
-"""Data and networks of a study: sequences of a data set or simulated ones, detector and fusion weights."""
+"""The data and networks of a study: recorded or simulated sequences, detector and fusion weights."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from cobevglue.settings import Settings
 __all__ = ["SEED", "SIMULATED", "StudySettings", "open_sequence", "sequence_frames", "sequence_names"]
 
 SIMULATED = "simulated"
-"""In place of a data set's name: simulated sequences."""
+"""Replaces a data set's name: sequences are simulated during the run."""
 SEED = 2406
-"""Of simulated sequences and disturbances; nothing was trained, tuned or tried on this one."""
+"""Seed of simulated sequences and their disturbances; not used for training, tuning or development."""
 
 _SIMULATED_SEQUENCES, _SIMULATED_FRAMES = 24, 20  # two on each of the test networks
 _AGENTS = (2, 3)
-"""Number of agents of simulated sequences, in turn."""
+"""Numbers of agents of simulated sequences, alternating."""
 
 _Count = Annotated[int, Field(ge=1)]
 
 
 class StudySettings(Settings):
-    """The data and the networks of a study; conditions are separate.
+    """The data and networks of a study, without the conditions.
 
     Attributes:
         dataset: name in `DATASETS`, or "simulated".
         root: of the data set; None for simulated sequences.
         split: name of the split.
         reader: further arguments of the data set's class (`open_dataset`).
-        scenarios: maximum number; None for all, 24 of simulated ones.
-        frames: maximum number of each scenario, from its beginning; None for all, 20 of simulated ones.
+        scenarios: maximum number; None for all, or 24 simulated ones.
+        frames: maximum number per scenario, from its start; None for all, or 20 simulated ones.
         seed: of all random numbers.
         detector: a shipped model's name, or a .safetensors file.
-        weights: folder with the weights of fusion methods, `<name>.safetensors`; None for those that are shipped.
-        untrained: use methods without weights of their own: with the detector's neck and head.
+        weights: folder with the weights of fusion methods, `<name>.safetensors`; None for the shipped ones.
+        untrained: use fusion methods without trained weights, with the detector's own neck and head.
         min_points: objects on which all agents together have fewer points are ignored.
 
     Raises:
@@ -65,7 +65,7 @@ class StudySettings(Settings):
 
 
 def sequence_names(settings: StudySettings) -> list[str]:
-    """The names of a study's sequences.
+    """The names of the sequences of a study.
 
     Raises:
         ValueError: no such data set or split (names the nearest); it has no root, or simulated sequences have one.
@@ -74,14 +74,14 @@ def sequence_names(settings: StudySettings) -> list[str]:
     """
     if settings.dataset == SIMULATED:
         if settings.root is not None:
-            raise ValueError("simulated sequences have no root")
+            raise ValueError("simulated sequences have no root: they are simulated during the run")
         if settings.reader:
             raise ValueError(f"options of a data set's reader have no effect on simulated sequences: {settings.reader}")
         return [_simulated(settings, number).name for number in range(settings.scenarios or _SIMULATED_SEQUENCES)]
     if settings.dataset not in DATASETS:
         raise ValueError(f"no data set {did_you_mean(settings.dataset, [SIMULATED, *DATASETS])}")
     if settings.root is None:
-        raise ValueError(f"the data set {settings.dataset} needs a root, the folder where it is")
+        raise ValueError(f"the data set {settings.dataset} needs a root, its folder")
     names = open_dataset(settings.dataset, settings.root, settings.split, settings.reader).scenarios
     if not names:
         raise ValueError(f"{settings.root}: the split {settings.split!r} has no scenarios")
@@ -89,7 +89,7 @@ def sequence_names(settings: StudySettings) -> list[str]:
 
 
 def open_sequence(settings: StudySettings, number: int) -> Scenario:
-    """Sequence `number` of `sequence_names`; nothing is read or simulated before a frame is used."""
+    """Sequence `number` of `sequence_names`; frames are read or simulated when they are used."""
     if settings.dataset == SIMULATED:
         return _simulated(settings, number)
     dataset = open_dataset(settings.dataset, settings.root or ".", settings.split, settings.reader)
@@ -97,7 +97,7 @@ def open_sequence(settings: StudySettings, number: int) -> Scenario:
 
 
 def sequence_frames(settings: StudySettings, sequence: Scenario) -> Iterator[Frame]:
-    """The evaluated frames of a sequence."""
+    """The frames of a sequence that a study uses."""
     return islice(iter(sequence), settings.frames)
 
 

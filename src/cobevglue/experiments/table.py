@@ -1,4 +1,4 @@
-"""A table of results, as Markdown for people and as CSV for programs."""
+"""A table of results, written as Markdown or CSV."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 __all__ = ["Cell", "Table"]
 
 Cell = str | int | float | None
-"""Text, a count, a measured number, or None for what was not measured."""
+"""Text, a count, a measured number, or None for a missing value."""
 
 _MISSING = "–"
 
@@ -21,14 +21,14 @@ class Table:
     """A table.
 
     Attributes:
-        name: short and in lower case, for files: "noise".
+        name: short and in lower case, for file names: "noise".
         title: the line above it.
-        columns: their names; the first column names the rows.
-        rows: the cells, as many in a row as there are columns.
+        columns: names; the first column holds the row names.
+        rows: cells, one per column.
         notes: sentences below it.
 
     Raises:
-        ValueError: a row has not as many cells as there are columns; says which.
+        ValueError: a row does not have one cell per column; names it.
     """
 
     name: str
@@ -38,13 +38,13 @@ class Table:
     notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what is not rectangular."""
+        """Check the length of each row."""
         for number, row in enumerate(self.rows):
             if len(row) != len(self.columns):
                 raise ValueError(f"{self.name}: row {number} has {len(row)} cells, not {len(self.columns)}")
 
     def text_rows(self) -> list[list[str]]:
-        """The cells as people read them: measured numbers in about three digits, a dash for what is missing."""
+        """The cells as text: measured numbers with about three digits, a dash for missing values."""
         return [[_text(cell) for cell in row] for row in self.rows]
 
     def to_markdown(self) -> str:
@@ -57,7 +57,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def to_csv(self) -> str:
-        """Header and rows with numbers in full; what is missing or NaN is an empty cell."""
+        """Header and rows with unrounded numbers; missing values and NaN are empty cells."""
         file = io.StringIO()
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(self.columns)
@@ -80,6 +80,6 @@ def _text(cell: Cell) -> str:
         return _MISSING
     if isinstance(cell, int):
         return f"{cell:,}"
-    if 1e-9 < abs(cell) < 0.01:  # such as a share of bytes; what is even less is rounding
+    if 1e-9 < abs(cell) < 0.01:  # such as a share of bytes; smaller values are rounding errors
         return f"{cell:.2g}"
     return f"{cell:,.0f}" if abs(cell) >= 100.0 else f"{cell:.1f}" if abs(cell) >= 10.0 else f"{cell:.3f}"

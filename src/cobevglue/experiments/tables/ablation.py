@@ -45,7 +45,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
             row.append(results.ap(condition, iou))
             if published:
                 row.append(published[geometry, tracking][iou])
-        quality = pose_quality([heard for _, heard in results.heard(condition)])
+        quality = pose_quality([pose for _, pose in results.received_poses(condition)])
         rows.append([*row, quality.refused, quality.wrong])
     alone: list[Cell] = ["no collaboration", "", ""]
     for iou in IOUS:

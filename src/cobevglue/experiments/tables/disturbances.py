@@ -67,7 +67,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     rows = []
     for title, what in _FURTHER.items():
         condition = _condition(scope, {"fusion": ours}, what)
-        quality = pose_quality([heard for _, heard in results.heard(condition)])
+        quality = pose_quality([pose for _, pose in results.received_poses(condition)])
         rows.append([title, quality.count, quality.refused, quality.wrong, quality.success_1, quality.success_3])
     columns = ("what goes wrong", "heard", "refused", "wrong of accepted", "within 1 m, 1°", "within 3 m, 3°")
     return [*tables, Table("disturbances_poses", "BEVGlue's poses under the same", columns, rows)]

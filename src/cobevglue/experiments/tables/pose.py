@@ -1,4 +1,4 @@
-"""The quality of each aligner's poses."""
+"""Pose errors and refusals of each aligner."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _GROUPS: dict[str, tuple[int, float]] = {
     "3": (3, 3),
     "4 and more": (4, float("inf")),
 }
-"""Numbers of co-visible objects: first and last."""
+"""Least and greatest number of co-visible objects of each group."""
 
 
 def _sources(scope: Scope) -> dict[str, str]:
-    """The first method with each source of poses."""
+    """The first method that uses each source of poses."""
     sources: dict[str, str] = {}
     for name in (*scope.localised, *scope.trusting):
         sources.setdefault(FUSION_METHODS[name].usual_aligner, name)
@@ -40,17 +40,17 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     rows: list[list[Cell]] = []
     for aligner, name in _sources(scope).items():
         for level in scope.levels:
-            heard = [one for _, one in results.heard(as_is(name, level))]
-            rows.append([aligner_title(aligner), level_name(level), *_cells(heard)])
+            poses = [pose for _, pose in results.received_poses(as_is(name, level))]
+            rows.append([aligner_title(aligner), level_name(level), *_cells(poses)])
     columns = ("poses from", "noise", *_COLUMNS)
-    pairs = list(results.heard(as_is(scope.localised[0])))
+    pairs = list(results.received_poses(as_is(scope.localised[0])))
     groups: list[list[Cell]] = []
     for group, (first, last) in _GROUPS.items():
-        heard = [one for co_visible, one in pairs if first <= co_visible <= last]
-        if heard:
-            groups.append([group, *_cells(heard)])
-    notes = ("Wrong: off by more than 3 m or 3°. A refusal is neither right nor wrong, and counts as no success.",)
-    note = ("Co-visible: ground-truth objects that tracked boxes of both agents overlap.",)
+        poses = [pose for co_visible, pose in pairs if first <= co_visible <= last]
+        if poses:
+            groups.append([group, *_cells(poses)])
+    notes = ("Wrong: an error of 3 m, 3° or more. A refusal is neither right nor wrong, and not a success.",)
+    seen = ("Co-visible: ground-truth objects that overlap with tracked boxes of both agents.",)
     return [
         Table("poses", "Poses by source and localisation noise", columns, rows, notes),
         Table(
@@ -75,8 +75,8 @@ _COLUMNS = (
 )
 
 
-def _cells(heard: Sequence[ReceivedPose]) -> list[Cell]:
-    quality = pose_quality(heard)
+def _cells(poses: Sequence[ReceivedPose]) -> list[Cell]:
+    quality = pose_quality(poses)
     shares = quality.refused, quality.success_1, quality.success_2, quality.success_3, quality.wrong
     return [quality.count, *shares, quality.translation, quality.yaw]
 

@@ -49,7 +49,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     rows: list[list[Cell]] = []
     for (label, budget), condition in _all_rows(scope).items():
         sent = label not in (method_title("none"), "True pose")
-        quality = pose_quality([heard for _, heard in results.heard(condition, every)])
+        quality = pose_quality([pose for _, pose in results.received_poses(condition, every)])
         milliseconds = results.milliseconds(condition).get("alignment") if sent else None
         rows.append(
             [
