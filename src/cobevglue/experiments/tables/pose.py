@@ -50,7 +50,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         if poses:
             groups.append([group, *_cells(poses)])
     notes = ("Wrong: an error of 3 m, 3° or more. A refusal is neither right nor wrong, and not a success.",)
-    seen = ("Co-visible: ground-truth objects that overlap with tracked boxes of both agents.",)
+    note = ("Co-visible: ground-truth objects that overlap with tracked boxes of both agents.",)
     return [
         Table("poses", "Poses by source and localisation noise", columns, rows, notes),
         Table(
