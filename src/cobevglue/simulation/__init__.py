@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact truth; so far a junction as the object lists that several agents would detect."""
+"""Synthetic scenes with exact ground truth; exported here: a junction with the object lists of several agents."""
 
 from cobevglue.simulation.object_lists import AgentView, Junction, JunctionSettings, ObjectListFrame
 

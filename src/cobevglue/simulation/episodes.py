@@ -1,4 +1,4 @@
-"""Simulated clouds for training and testing a detector: many short looks into many worlds."""
+"""Simulated clouds for training and testing a detector: a few snapshots of each of many worlds."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = ["EpisodeSettings", "SimulatedEpisodes"]
 
 _EPISODE_STREAM = 30
 _AGENT_KINDS = ("sedan", "hatchback", "coupe", "suv")
-"""What may carry a sensor: it stands 1.9 m high, above the roof."""
+"""Kinds of vehicle that can carry a sensor: their roofs are below its height of 1.9 m."""
 
 
 class EpisodeSettings(Settings):
-    """What an episode is made of.
+    """Settings of an episode.
 
     Attributes:
-        snapshots: how many instants of a world are looked at.
-        agents: how many vehicles look at each.
-        interval: time between instants [s].
-        lidars: the sensors by their names in `LIDARS` and how often each is used.
-        vary_sensor: change drop-outs, noise and height from episode to episode, so that no exact sensor is learnt.
+        snapshots: number of snapshots of a world.
+        agents: number of agents in each snapshot.
+        interval: mean time between snapshots [s].
+        lidars: names of sensors in `LIDARS` and their weights.
+        vary_sensor: randomise drop-outs, noise and height per episode, against overfitting to one sensor.
         keep_own_points: share of clouds that keep the points on the agent's own body.
     """
 
@@ -45,12 +45,12 @@ class EpisodeSettings(Settings):
 
 @dataclass(frozen=True)
 class SimulatedEpisodes:
-    """Episodes of one split. Same split, seed and settings: the same episodes, in any process.
+    """Episodes of one split, determined by split, seed and settings.
 
     Attributes:
-        split: "train", "validation" or "test"; their networks and their randomness are disjoint.
-        seed: a whole number >= 0.
-        settings: what an episode is made of.
+        split: "train", "validation" or "test"; their networks and random streams are disjoint.
+        seed: integer >= 0.
+        settings: of an episode.
 
     Raises:
         ValueError: an unknown split or sensor.
@@ -65,10 +65,10 @@ class SimulatedEpisodes:
             raise ValueError(f"split must be one of {', '.join(NETWORKS)}, got {self.split!r}")
         for name in self.settings.lidars:
             if name not in LIDARS:
-                raise ValueError(f"lidars: no sensor {name!r}; there are: {', '.join(LIDARS)}")
+                raise ValueError(f"lidars: no sensor {name!r}; known: {', '.join(LIDARS)}")
 
     def episode(self, index: int) -> list[LabelledCloud]:
-        """`snapshots` x `agents` clouds of one world, fewer where there are fewer vehicles that can carry a sensor."""
+        """Up to `snapshots` x `agents` clouds of one world; fewer if too few vehicles can carry a sensor."""
         networks = NETWORKS[self.split]
         rng = np.random.default_rng([self.seed, _EPISODE_STREAM + tuple(NETWORKS).index(self.split), index])
         world_seed = int(rng.integers(2**31))
@@ -84,7 +84,7 @@ class SimulatedEpisodes:
             for snapshot in range(self.settings.snapshots):
                 traffic.step(round(float(rng.uniform(0.5, 1.5)) * self.settings.interval, 1))
                 now = world.at(traffic.vehicles())
-                agents = _agents(now.moving, self.settings.agents, rng)
+                agents = _choose_agents(now.moving, self.settings.agents, rng)
                 sensors = [(now.sensor_on_vehicle(agent, lidar, rng), agent) for agent in agents]
                 views = now.views(sensors, [lidar] * len(sensors), snapshot)
                 clouds += [_labelled(view, rng.random() < self.settings.keep_own_points) for view in views]
@@ -102,17 +102,17 @@ def _varied(lidar: LidarSettings, rng: np.random.Generator) -> LidarSettings:
     )
 
 
-def _agents(vehicles: Boxes, count: int, rng: np.random.Generator) -> list[int]:
-    """Ids of up to `count` vehicles that may carry a sensor, preferring those that have many others around them."""
+def _choose_agents(vehicles: Boxes, count: int, rng: np.random.Generator) -> list[int]:
+    """Ids of up to `count` vehicles that can carry a sensor, drawn in proportion to their number of neighbours."""
     assert vehicles.track_id is not None
     assert vehicles.label is not None
-    able = np.flatnonzero(np.isin(vehicles.label, _AGENT_KINDS))
-    if not len(able):
+    eligible = np.flatnonzero(np.isin(vehicles.label, _AGENT_KINDS))
+    if not len(eligible):
         return []
     xy = vehicles.center[:, :2]
-    around = (np.hypot(*(xy[able, None] - xy[None]).transpose(2, 0, 1)) < 50.0).sum(axis=1)
-    weight = around / around.sum()
-    chosen = rng.choice(able, size=min(count, len(able)), replace=False, p=weight)
+    neighbours = (np.hypot(*(xy[eligible, None] - xy[None]).transpose(2, 0, 1)) < 50.0).sum(axis=1)
+    weight = neighbours / neighbours.sum()
+    chosen = rng.choice(eligible, size=min(count, len(eligible)), replace=False, p=weight)
     ids: list[int] = vehicles.track_id[chosen].tolist()
     return ids
 

@@ -1,4 +1,4 @@
-"""Writes simulated scenarios as files of a data set: in several processes, and where it was interrupted it goes on."""
+"""Export of simulated scenarios to the files of a data set, in several processes; resumes after an interruption."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from cobevglue.simulation.layouts import Layout, Task
 __all__ = ["ExportReport", "export"]
 
 _Progress = Callable[[int, int], None]
-_PATIENCE = 1.0  # between two looks at whether the workers are alive [s]
-_LAST_FRAME = 30.0  # a worker that is told to stop finishes its frame within this time [s]
+_POLL_INTERVAL = 1.0  # between checks that the workers are alive [s]
+_STOP_TIMEOUT = 30.0  # for a worker to finish its frame before it is terminated [s]
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was done.
+    """Result of an export.
 
     Attributes:
-        frames_written: frames of which something was missing.
-        frames_kept: frames that were there already.
+        frames_written: number of frames with missing files, which were written.
+        frames_kept: number of frames that were already complete.
     """
 
     frames_written: int
@@ -43,18 +43,18 @@ class _Part:
 
 
 def export(layout: Layout, tasks: Sequence[Task], *, workers: int = 1, progress: _Progress) -> ExportReport:
-    """Write scenarios. The files are the same bytes with any number of workers.
+    """Write scenarios. The files are byte-identical for any number of workers.
 
-    Each file appears complete or not at all, and what is there already is kept.
+    Files are written atomically; existing ones are kept.
 
     Args:
-        layout: the format, and where.
+        layout: format and folder of the data set.
         tasks: the scenarios.
-        workers: how many processes; with 1 it is done in this one.
-        progress: called with how many frames are there and how many there will be.
+        workers: number of processes; 1 runs in the current one.
+        progress: called with the number of complete frames and the total.
 
     Raises:
-        ValueError: the format has no room for such scenarios, or there are files of something else.
+        ValueError: the format does not support such scenarios, or the folder contains other files.
         OSError: a file cannot be written.
     """
     for task in tasks:
@@ -67,7 +67,7 @@ def export(layout: Layout, tasks: Sequence[Task], *, workers: int = 1, progress:
     done = frames - written
     progress(done, frames)
     shares = _shares(parts, workers)
-    with closing(_work_here(layout, shares) if len(shares) < 2 else _work_in_processes(layout, shares)) as work:
+    with closing(_write_locally(layout, shares) if len(shares) < 2 else _write_in_processes(layout, shares)) as work:
         for _ in work:
             done += 1
             progress(done, frames)
@@ -76,37 +76,37 @@ def export(layout: Layout, tasks: Sequence[Task], *, workers: int = 1, progress:
 
 
 def _shares(parts: Sequence[_Part], workers: int) -> list[list[_Part]]:
-    """About as many frames for each worker, those of one scenario together as far as possible: its world is costly."""
+    """Split the frames evenly over the workers, with few splits within a scenario: building its world is expensive."""
     total = sum(len(part.frames) for part in parts)
     workers = max(1, min(workers, total))
     ends = [total * (worker + 1) // workers for worker in range(workers)]
     shares: list[list[_Part]] = [[] for _ in range(workers)]
-    worker = given = 0
+    worker = assigned = 0
     for part in parts:
         frames = part.frames
         while frames:
-            room = ends[worker] - given
+            room = ends[worker] - assigned
             if room:
                 shares[worker].append(_Part(part.task, frames[:room]))
-            given += min(room, len(frames))
+            assigned += min(room, len(frames))
             frames = frames[room:]
-            worker += given == ends[worker]
+            worker += assigned == ends[worker]
     return shares
 
 
-def _work_here(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Generator[None, None, None]:
+def _write_locally(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Generator[None, None, None]:
     """Write every frame; yields after each."""
     for part in (part for share in shares for part in share):
-        # A copy has computed nothing yet, and its world is forgotten when it is done.
+        # A fresh copy: its cached world is freed with it.
         task = Task(part.task.number, copy.copy(part.task.scenario))
         for index in part.frames:
             layout.write(task, index)
             yield
 
 
-def _work_in_processes(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Generator[None, None, None]:
-    """Write every frame, each share in a process of its own; yields after each."""
-    context = multiprocessing.get_context("spawn")  # a fork would share SUMO, and does not get on with threads
+def _write_in_processes(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Generator[None, None, None]:
+    """Write every frame, each share in its own process; yields after each."""
+    context = multiprocessing.get_context("spawn")  # fork would share SUMO's state and is unsafe with threads
     results: Any = context.Queue()
     stop = context.Event()
     processes = [context.Process(target=_worker, args=(layout, share, results, stop), daemon=True) for share in shares]
@@ -116,7 +116,7 @@ def _work_in_processes(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Gen
     try:
         while left:
             try:
-                result = results.get(timeout=_PATIENCE)
+                result = results.get(timeout=_POLL_INTERVAL)
             except queue.Empty:
                 crashed = [process.exitcode for process in processes if process.exitcode]
                 if crashed:
@@ -129,17 +129,17 @@ def _work_in_processes(layout: Layout, shares: Sequence[Sequence[_Part]]) -> Gen
     finally:
         stop.set()
         for process in processes:
-            process.join(_LAST_FRAME)
+            process.join(_STOP_TIMEOUT)
             process.terminate()
         results.cancel_join_thread()
 
 
 def _worker(layout: Layout, share: Sequence[_Part], results: Any, stop: Any) -> None:
-    """In a process of its own: write frames and say so after each; or say what went wrong."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; the first one stops us
+    """Write frames in a worker process; put None after each frame, or the exception, into `results`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent stops the workers
     with suppress(BrokenPipeError):
         try:
-            for _ in _work_here(layout, [share]):
+            for _ in _write_locally(layout, [share]):
                 results.put(None)
                 if stop.is_set():
                     return

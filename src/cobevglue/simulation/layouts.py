@@ -1,4 +1,4 @@
-"""Where the files of simulated scenarios are in each data set's format, which are missing, and writing them."""
+"""Layouts of data sets: locate, check and write the files of simulated scenarios in each data set's format."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Task:
     """One scenario of a data set to write.
 
     Attributes:
-        number: of the scenario in its split, from 0.
-        scenario: what to write.
+        number: index of the scenario in its split, from 0.
+        scenario: the scenario.
     """
 
     number: int
@@ -49,7 +49,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Layout(ABC):
-    """A data set's folders and files.
+    """Folders and files of a data set.
 
     Attributes:
         root: folder of the data set.
@@ -62,28 +62,28 @@ class Layout(ABC):
     labels_only: bool = False
 
     agents: ClassVar[int | None] = None
-    """How many vehicles the format has; None for any number."""
+    """Number of vehicles in the format; None for any number."""
     roadside_units: ClassVar[int | None] = None
-    """How many roadside units the format has; None for any number."""
+    """Number of roadside units in the format; None for any number."""
 
     def check(self, settings: ScenarioSettings) -> None:
-        """Whether the format has room for such scenarios.
+        """Check that the format supports scenarios with these settings.
 
         Raises:
-            ValueError: it has not.
+            ValueError: it does not.
         """
-        for what in ("agents", "roadside_units"):
-            has, wanted = getattr(self, what), getattr(settings, what)
-            if has is not None and wanted != has:
-                raise ValueError(f"{what.replace('_', ' ')}: this format has exactly {has}, got {wanted}")
+        for field in ("agents", "roadside_units"):
+            required, got = getattr(self, field), getattr(settings, field)
+            if required is not None and got != required:
+                raise ValueError(f"{field.replace('_', ' ')}: this format has exactly {required}, got {got}")
         if settings.rate != 10.0:
-            raise ValueError(f"rate: files are numbered for 10 frames a second, got {settings.rate}")
+            raise ValueError(f"rate: must be 10 Hz for this format's file names, got {settings.rate}")
 
     def claim(self, task: Task) -> None:
-        """Note what the scenario is made from, before any of its frames is written.
+        """Write the scenario's manifest before its frames.
 
         Raises:
-            ValueError: there are files of something else.
+            ValueError: the folder contains another scenario, or files without a manifest.
         """
         path = self._manifest(task)
         scenario = task.scenario
@@ -96,26 +96,26 @@ class Layout(ABC):
         }
         if path.exists():
             if _read_json(path) != content:
-                raise ValueError(f"{path}: a scenario with other settings is there already; take another folder")
+                raise ValueError(f"{path}: exists with other settings; choose another folder")
         elif self._has_foreign_files(task):
-            raise ValueError(f"{path.parent}: is there already and has no {path.name}: not made by this command")
+            raise ValueError(f"{path.parent}: exists without {path.name}: not written by this command")
         else:
             write_json(path, content, indent=1)
 
-    def place(self, task: Task) -> Path:
-        """Where the scenario's files are, for the user."""
+    def scenario_folder(self, task: Task) -> Path:
+        """Folder of the scenario's manifest, which is reported to the user."""
         return self._manifest(task).parent
 
     @abstractmethod
     def missing(self, task: Task) -> list[int]:
-        """The frames of which a file may be missing."""
+        """Indices of the frames with missing files."""
 
     @abstractmethod
     def write(self, task: Task, index: int) -> None:
-        """Write what is missing of one frame."""
+        """Write the missing files of one frame."""
 
     def finish(self, tasks: Sequence[Task]) -> None:  # noqa: B027
-        """Write what belongs to the whole data set, when all frames are there."""
+        """Write the files of the data set as a whole, after all frames."""
 
     @abstractmethod
     def _manifest(self, task: Task) -> Path: ...
@@ -134,21 +134,21 @@ class _TreeLayout(Layout):
 
     def missing(self, task: Task) -> list[int]:
         """See `Layout`."""
-        folder, settings = self.place(task), task.scenario.settings
+        folder, settings = self.scenario_folder(task), task.scenario.settings
         agents = [entry for entry in folder.iterdir() if entry.is_dir()]
         frames = range(len(task.scenario))
         if len(agents) < settings.agents + settings.roadside_units:
             return list(frames)
-        there = {(agent.name, file.name) for agent in agents for file in agent.iterdir()}
+        existing = {(agent.name, file.name) for agent in agents for file in agent.iterdir()}
         return [
             index
             for index in frames
-            if not all((agent.name, name) in there for agent in agents for name in self._names(index))
+            if not all((agent.name, name) in existing for agent in agents for name in self._names(index))
         ]
 
     def write(self, task: Task, index: int) -> None:
         """See `Layout`."""
-        folder, scenario = self.place(task), task.scenario
+        folder, scenario = self.scenario_folder(task), task.scenario
         for number, (agent, view) in enumerate(scenario.views(index).items()):
             agent_folder = folder / self._agent_folder(number, scenario.carriers[agent])
             if not all((agent_folder / name).is_file() for name in self._names(index)):
@@ -170,12 +170,12 @@ class _TreeLayout(Layout):
         return self.root / self.split / task.scenario.name / _MANIFEST
 
     def _has_foreign_files(self, task: Task) -> bool:
-        folder = self.place(task)
+        folder = self.scenario_folder(task)
         return folder.exists() and any(folder.iterdir())
 
 
 class OPV2VLayout(_TreeLayout):
-    """OPV2V, or V2XSet with roadside units: agents are called by their vehicles' ids, or -1, -2 and so on."""
+    """OPV2V, or V2XSet with roadside units: agents are named by vehicle ids, roadside units -1, -2, …"""
 
     number_step: ClassVar[int] = 2
 
@@ -201,7 +201,7 @@ class OPV2VLayout(_TreeLayout):
 
 
 class V2V4RealLayout(_TreeLayout):
-    """V2V4Real: two cars, called 0 and 1."""
+    """V2V4Real: two vehicles named 0 and 1."""
 
     number_step: ClassVar[int] = 1
     agents: ClassVar[int | None] = 2
@@ -218,7 +218,7 @@ class V2V4RealLayout(_TreeLayout):
 
 
 class DAIRV2XLayout(Layout):
-    """DAIR-V2X-C: one car and one roadside unit; a scenario is a batch."""
+    """DAIR-V2X-C: one vehicle and one roadside unit; each scenario is a batch."""
 
     agents: ClassVar[int | None] = 1
     roadside_units: ClassVar[int | None] = 1
@@ -263,7 +263,7 @@ class DAIRV2XLayout(Layout):
 
 
 LAYOUTS: dict[str, type[Layout]] = {"opv2v": OPV2VLayout, "v2v4real": V2V4RealLayout, "dair-v2x": DAIRV2XLayout}
-"""Formats that can be written, by the names of the data sets."""
+"""Layouts by data set name."""
 
 
 def _ids(view: LidarView) -> IntArray:
@@ -272,12 +272,12 @@ def _ids(view: LidarView) -> IntArray:
 
 
 def _speeds(snapshot: TrafficSnapshot) -> dict[int, float]:
-    """[km/h] by id; parked vehicles are not there."""
+    """Speeds [km/h] by vehicle id, without parked vehicles."""
     return dict(zip(snapshot.id.tolist(), (_KMH * snapshot.speed).tolist(), strict=True))
 
 
 def _world_SE3_vehicle(scenario: SimulatedScenario, snapshot: TrafficSnapshot, vehicle: int) -> FloatArray:
-    """(4, 4) pose of a vehicle's middle on the ground, upright."""
+    """(4, 4) pose of a vehicle's centre on the ground, without roll and pitch."""
     row = int(np.flatnonzero(snapshot.id == vehicle)[0])
     x, y, yaw = float(snapshot.x[row]), float(snapshot.y[row]), float(snapshot.yaw[row])
     pose = np.eye(4)
@@ -290,4 +290,4 @@ def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{path}: not readable as JSON: {error}") from None
+        raise ValueError(f"{path}: invalid JSON: {error}") from None

@@ -1,7 +1,7 @@
-"""A spinning LiDAR: rays of a beam table, cast through a scene of triangles with Embree, with a sensor's imperfections.
+"""A spinning LiDAR: ray casting of a beam table through a triangle mesh with Embree, with noise and drop-outs.
 
-The default is the sensor of OPV2V, that is CARLA's ray-cast LiDAR as OPV2V set it: 64 beams from -25 to +2 degrees,
-1016 shots a turn, 120 m, 2 cm range noise, one point in ten lost, all points of one instant.
+The default is OPV2V's configuration of CARLA's ray-cast LiDAR: 64 beams from -25 to +2 degrees, 1016 points per beam
+and revolution, 120 m range, 2 cm range noise, 10 % drop-out, all points measured at the same time.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ __all__ = ["LIDARS", "Cloud", "LidarSettings", "RayScene", "scan"]
 
 _BACKGROUND = -1
 _BEYOND_SURFACE = 0.01
-"""A ray that goes through a surface starts anew this far behind it [m]."""
-_MOST_SURFACES = 3
-"""A ray that went through this many surfaces is lost."""
+"""A transmitted ray starts again at this distance behind the surface [m]."""
+_MAX_SURFACES = 3
+"""A ray transmitted by this many surfaces has no return."""
 
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class LidarSettings(Settings):
-    """What the sensor is like.
+    """Settings of a LiDAR.
 
     Attributes:
-        beams: how many rings.
-        elevation: of the lowest and the highest ring [degrees], upwards.
-        shots: how many a ring has in one turn.
-        range: the farthest return [m].
-        height: of the sensor above the ground [m].
+        beams: number of rings.
+        elevation: elevation of the lowest and the highest ring [degrees], positive upwards.
+        shots: points per ring and revolution.
+        range: maximum range [m].
+        height: height above the ground [m].
         range_noise: standard deviation along the ray [m].
-        angle_noise: standard deviation of azimuth and elevation [degrees]; CARLA has none.
-        dropout: share of points lost at random.
-        dropout_intensity: points weaker than this are lost too, the more the weaker they are …
-        dropout_at_zero: … up to this share at intensity 0.
-        attenuation: of the intensity with distance [1/m]: exp(-attenuation * distance).
-        intensity: "distance" gives every surface the same reflectivity, as CARLA does; "surface" uses the surface's own
-            and the angle at which it is hit.
+        angle_noise: standard deviation of azimuth and elevation [degrees]; 0 in CARLA.
+        dropout: drop-out probability of every point.
+        dropout_intensity: points below this intensity have an additional drop-out probability, which grows linearly …
+        dropout_at_zero: … to this value at intensity 0.
+        attenuation: decay of the intensity with distance [1/m]: exp(-attenuation * distance).
+        intensity: "distance": the same reflectivity for all surfaces, as in CARLA; "surface": the surface's reflectivity
+            and the angle of incidence.
     """
 
     beams: Annotated[int, Field(ge=1, le=512)] = 64
@@ -62,7 +62,7 @@ class LidarSettings(Settings):
     intensity: Literal["distance", "surface"] = "distance"
 
     def directions(self) -> Float32Array:
-        """(beams * shots, 3) unit vectors in the sensor's frame, ring by ring from below, each from azimuth -180."""
+        """(beams * shots, 3) unit vectors in the LiDAR frame; rings from the lowest, azimuth from -180 degrees."""
         return _directions(self.beams, self.elevation, self.shots)
 
 
@@ -76,16 +76,16 @@ LIDARS: dict[str, LidarSettings] = {
     ),
     "roadside": LidarSettings(elevation=(-40.0, 0.0), height=5.0),
 }
-"""Sensors by name: OPV2V's, two like those of 32 and 16 beams on real cars, and one that looks down from a mast."""
+"""Sensors by name: OPV2V's, two typical automotive ones with 32 and 16 beams, and one for roadside units."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cloud:
-    """One turn of the sensor.
+    """One revolution of the sensor.
 
     Attributes:
-        points: (N, 4) float32 x, y, z [m] in the sensor's frame, and intensity in [0, 1].
-        owner: (N,) which owner of the scene each point lies on, -1 for the background.
+        points: (N, 4) float32 x, y, z [m] in the LiDAR frame, and intensity in [0, 1].
+        owner: (N,) object id of each point, -1 for the background.
     """
 
     points: Float32Array
@@ -93,23 +93,23 @@ class Cloud:
 
 
 class RayScene:
-    """Triangles that rays can be cast at.
+    """A triangle mesh with an acceleration structure for ray casting.
 
     Attributes:
         mesh: the triangles, in the world frame.
-        owner: (T,) whose each triangle is, -1 for the background.
-        see_through: whether rays go through any of them.
+        owner: (T,) object id of each triangle, -1 for the background.
+        transmissive: whether any triangle transmits rays.
     """
 
     def __init__(self, mesh: Mesh, owner: IntArray | None = None) -> None:
         """Build the acceleration structure.
 
         Raises:
-            ModuleNotFoundError: embreex is not installed; says how to.
+            ModuleNotFoundError: embreex is not installed.
         """
         self.mesh = mesh
         self.owner = np.full(len(mesh), _BACKGROUND, dtype=np.int64) if owner is None else owner
-        self.see_through = bool((mesh.transmission > 0.0).any())
+        self.transmissive = bool((mesh.transmission > 0.0).any())
         self._embree: Any = None
         if len(mesh):
             try:
@@ -123,7 +123,7 @@ class RayScene:
             TriangleMesh(self._embree, mesh.vertices, mesh.faces)
 
     def first_hits(self, origins: Float32Array, directions: Float32Array) -> tuple[Float32Array, IntArray]:
-        """(R,) distance [m] to the first triangle along each ray, infinite for none; (R,) its row, -1 for none."""
+        """(R,) distance [m] to the first triangle along each ray, infinite without a hit; (R,) its index or -1."""
         if self._embree is None:
             return np.full(len(origins), np.inf, dtype=np.float32), np.full(len(origins), -1, dtype=np.int32)
         hits = self._embree.run(origins, directions, output=True)
@@ -143,28 +143,28 @@ class RayScene:
 def scan(
     scenes: tuple[RayScene, ...], world_SE3_lidar: FloatArray, settings: LidarSettings, rng: np.random.Generator
 ) -> Cloud:
-    """What the sensor returns from one place.
+    """Simulate one revolution of the sensor at a fixed pose.
 
     Args:
-        scenes: triangles in the world frame; a ray ends at the nearest of all of them.
+        scenes: triangles in the world frame; a ray ends at the nearest hit in any scene.
         world_SE3_lidar: (4, 4) pose of the sensor.
-        settings: the sensor.
-        rng: for noise, drop-outs, and whether a ray goes through glass.
+        settings: of the sensor.
+        rng: for noise, drop-outs and transmission.
     """
     local = _noisy(settings.directions(), settings.angle_noise, rng)
     rotation = world_SE3_lidar[:3, :3].astype(np.float32)
-    # Not `local @ rotation.T`: BLAS would take all cores for it and wait on them busily, beside other processes.
+    # Not `local @ rotation.T`: BLAS threads would compete with other processes for the cores.
     directions = local[:, :1] * rotation[:, 0] + local[:, 1:2] * rotation[:, 1] + local[:, 2:] * rotation[:, 2]
     start = world_SE3_lidar[:3, 3].astype(np.float32)
     hits = _opaque_hits(scenes, start, directions, rng)
-    seen = np.flatnonzero(hits.distance < settings.range)
-    distance = hits.distance[seen]
+    returned = np.flatnonzero(hits.distance < settings.range)
+    distance = hits.distance[returned]
     intensity = np.exp(-settings.attenuation * distance)
     if settings.intensity == "surface":
-        intensity = intensity * _reflected(scenes, hits, directions, seen)
+        intensity = intensity * _reflected(scenes, hits, directions, returned)
     weak = settings.dropout_at_zero * np.clip(1.0 - intensity / max(settings.dropout_intensity, 1e-6), 0.0, 1.0)
-    kept = rng.random(len(seen), dtype=np.float32) < (1.0 - settings.dropout) * (1.0 - weak)
-    row = seen[kept]
+    kept = rng.random(len(returned), dtype=np.float32) < (1.0 - settings.dropout) * (1.0 - weak)
+    row = returned[kept]
     noisy = distance[kept] + settings.range_noise * rng.standard_normal(len(row), dtype=np.float32)
     points = np.empty((len(row), 4), dtype=np.float32)
     points[:, :3] = local[row] * noisy[:, None]
@@ -178,7 +178,7 @@ def scan(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Hits:
-    """Where each ray ended: (R,) distance [m], infinite for nowhere; which of the scenes, and its triangle's row."""
+    """(R,) hit of each ray: distance [m], infinite without a hit; index of the scene; index of the triangle in it."""
 
     distance: Float32Array
     scene: IntArray
@@ -188,34 +188,34 @@ class _Hits:
 def _opaque_hits(
     scenes: tuple[RayScene, ...], start: Float32Array, directions: Float32Array, rng: np.random.Generator
 ) -> _Hits:
-    """Cast rays from one point until each has met a surface that it does not go through."""
+    """Cast rays from one point to the first surface that does not transmit them."""
     hits = _nearest_hits(scenes, np.tile(start, (len(directions), 1)), directions)
-    going = np.arange(len(directions))
+    active = np.arange(len(directions))
     last = hits
-    for surface in range(_MOST_SURFACES):
-        transmission = np.zeros(len(going), dtype=np.float32)
+    for surface in range(_MAX_SURFACES):
+        transmission = np.zeros(len(active), dtype=np.float32)
         for number, scene in enumerate(scenes):
-            if scene.see_through:
+            if scene.transmissive:
                 here = np.flatnonzero((last.scene == number) & np.isfinite(last.distance))
                 transmission[here] = scene.mesh.transmission[last.triangle[here]]
         through = np.flatnonzero(transmission > 0.0)
         through = through[rng.random(len(through)) < transmission[through]]
         if not len(through):
             break
-        going = going[through]
-        travelled = hits.distance[going] + np.float32(_BEYOND_SURFACE)
-        if surface + 1 == _MOST_SURFACES:
-            hits.distance[going] = np.inf
+        active = active[through]
+        travelled = hits.distance[active] + np.float32(_BEYOND_SURFACE)
+        if surface + 1 == _MAX_SURFACES:
+            hits.distance[active] = np.inf
             break
-        onwards = directions[going]
+        onwards = directions[active]
         last = _nearest_hits(scenes, start + onwards * travelled[:, None], onwards)
-        hits.distance[going] = travelled + last.distance
-        hits.scene[going], hits.triangle[going] = last.scene, last.triangle
+        hits.distance[active] = travelled + last.distance
+        hits.scene[active], hits.triangle[active] = last.scene, last.triangle
     return hits
 
 
 def _nearest_hits(scenes: tuple[RayScene, ...], origins: Float32Array, directions: Float32Array) -> _Hits:
-    """The first triangle of any scene along each ray."""
+    """The nearest hit of each ray in all scenes."""
     distance, triangle = scenes[0].first_hits(origins, directions)
     of_scene = np.zeros(len(origins), dtype=np.int64)
     for number, scene in enumerate(scenes[1:], start=1):
@@ -228,7 +228,7 @@ def _nearest_hits(scenes: tuple[RayScene, ...], origins: Float32Array, direction
 
 
 def _reflected(scenes: tuple[RayScene, ...], hits: _Hits, directions: Float32Array, rays: IntArray) -> Float32Array:
-    """(len(rays),) the share that comes back: the surface's reflectivity, less at grazing angles."""
+    """(len(rays),) reflected share: the surface's reflectivity times the square root of the cosine of incidence."""
     share = np.zeros(len(rays), dtype=np.float32)
     for number, scene in enumerate(scenes):
         here = np.flatnonzero(hits.scene[rays] == number)
@@ -257,7 +257,7 @@ def _noisy(directions: Float32Array, degrees: float, rng: np.random.Generator) -
 
 
 def _unit_vectors(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
-    """(…, 3) for angles [rad] that broadcast."""
+    """(…, 3) unit vectors for broadcastable angles [rad]."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)

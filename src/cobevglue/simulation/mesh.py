@@ -1,4 +1,4 @@
-"""Triangle meshes with what a LiDAR needs to know of a surface, and the primitives that shapes are made of."""
+"""Triangle meshes with reflectivity and transmission for a LiDAR, and geometric primitives."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["Mesh", "box", "cylinder", "ellipsoid", "leaves", "quads"]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Mesh:
-    """T triangles over V corners, which neighbours may share.
+    """T triangles over V vertices.
 
     Attributes:
-        vertices: (V, 3) float32 corners [m], axes x forward, y left, z up.
+        vertices: (V, 3) float32 [m], axes x forward, y left, z up.
         faces: (T, 3) int32 rows of `vertices`.
-        reflectivity: (T,) float32 share of the light that comes back, 0 to 1.
-        transmission: (T,) float32 probability that a ray goes on through: 0 for a wall, near 1 for clear glass.
+        reflectivity: (T,) float32 reflected share of the light, 0 to 1.
+        transmission: (T,) float32 probability that a ray passes through: 0 for a wall, near 1 for clear glass.
     """
 
     vertices: Float32Array
@@ -43,7 +43,7 @@ class Mesh:
 
     @staticmethod
     def concatenate(meshes: Sequence[Mesh]) -> Mesh:
-        """All triangles of several meshes, in their order."""
+        """Concatenate the triangles of several meshes in order."""
         if not meshes:
             return Mesh.of(np.zeros((0, 3, 3)))
         first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])], dtype=np.int32)
@@ -63,19 +63,19 @@ class Mesh:
         return self.vertices[self.faces]
 
     def welded(self) -> Mesh:
-        """The same triangles with equal corners stored once: cheaper to move, and to build a scene of."""
+        """Merge identical vertices, which makes transforms and scene construction cheaper."""
         vertices, row = np.unique(self.vertices, axis=0, return_inverse=True)
         return replace(self, vertices=vertices, faces=row.reshape(-1).astype(np.int32)[self.faces])
 
     def moved(self, xyz: ArrayLike, yaw: float = 0.0, scale: ArrayLike = 1.0) -> Mesh:
-        """Scaled about the origin, turned about z by `yaw` [rad], then shifted by `xyz` [m]."""
+        """Scale about the origin, rotate about z by `yaw` [rad], then translate by `xyz` [m]."""
         c, s = np.cos(yaw), np.sin(yaw)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        vertices = (self.vertices * np.asarray(scale, dtype=np.float64)) @ turn.T + np.asarray(xyz, dtype=np.float64)
+        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        vertices = (self.vertices * np.asarray(scale, dtype=np.float64)) @ rotation.T + np.asarray(xyz, dtype=np.float64)
         return replace(self, vertices=vertices.astype(np.float32))
 
     def bounds(self) -> tuple[Float32Array, Float32Array]:
-        """(3,) lower and (3,) upper corner of the axis-aligned box around all triangles."""
+        """(3,) lower and (3,) upper corner of the axis-aligned bounding box."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
@@ -87,7 +87,7 @@ def box(center: ArrayLike, size: ArrayLike, yaw: float = 0.0, reflectivity: floa
 def cylinder(
     center: ArrayLike, radius: float, height: float, reflectivity: float = 0.5, axis: str = "z", sides: int = 8
 ) -> Mesh:
-    """A closed cylinder about its centre, along the axis "z" or "y"."""
+    """A closed cylinder with its centre [m], radius [m] and height [m] along the axis "z" or "y"."""
     corners = _unit_cylinder(sides) * np.array([radius, radius, height], dtype=np.float32)
     if axis == "y":
         corners = corners[:, :, [0, 2, 1]]
@@ -107,7 +107,7 @@ def leaves(
     leaf: float = 0.5,
     reflectivity: float = 0.4,
 ) -> Mesh:
-    """Foliage: `count` small triangles with edges of about `leaf` [m], at random all over an ellipsoid."""
+    """Foliage: `count` random triangles with edges of about `leaf` [m] inside an ellipsoid."""
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     middle = direction * rng.uniform(0.3, 1.0, size=(count, 1)) ** (1 / 3) * np.asarray(radii, dtype=np.float64)
@@ -116,7 +116,7 @@ def leaves(
 
 
 def quads(corners: ArrayLike, reflectivity: float = 0.5, transmission: float = 0.0) -> Mesh:
-    """Two triangles for each of Q four-cornered faces, given as (Q, 4, 3) corners in order around the face."""
+    """Two triangles for each of Q quadrilaterals with corners (Q, 4, 3) in order around the face."""
     faces = np.asarray(corners, dtype=np.float32).reshape(-1, 4, 3)
     return Mesh.of(np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]), reflectivity, transmission)
 

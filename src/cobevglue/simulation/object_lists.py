@@ -1,12 +1,12 @@
-"""A seeded junction as the object lists that several agents would detect, with the truth beside them.
+"""A junction as object lists that several agents detect, with the ground truth; deterministic for a seed.
 
     for frame in Junction(seed=1):
         ego, other = frame.agents["car1"], frame.agents["car2"]
         ego.boxes, other.boxes                  # what each detected, in its own LiDAR frame
-        frame.ego_SE2_other("car1", "car2")     # what an aligner should find
-        frame.matches("car1", "car2")           # the rows that are the same vehicle
+        frame.ego_SE2_other("car1", "car2")     # the true relative pose
+        frame.matches("car1", "car2")           # pairs of rows of the same vehicle
 
-There is no LiDAR here: boxes come from the true ones by line of sight and a detector's error model.
+Without LiDAR simulation: detections are the visible true boxes with the errors of `DetectionErrors`.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class JunctionSettings(Settings):
-    """What the junction is like.
+    """Settings of the junction.
 
     Attributes:
-        agents: how many agents, 1 to 8; they are called car1, car2, … and start on different arms.
-        vehicles: how many vehicles, agents included, 1 to 100.
-        duration: how long the scene lasts [s].
-        rate: frames a second [Hz].
-        sensor_range: agents see objects whose centre is at most this far away [m].
-        min_visible: an object is seen if at least this part of its angular width is not hidden behind others.
-        errors: what the detectors do wrong; `DetectionErrors.none()` for perfect ones.
+        agents: number of agents, 1 to 8; named car1, car2, …; the first four start on different arms.
+        vehicles: number of vehicles including agents, 1 to 100.
+        duration: duration of the scene [s].
+        rate: frame rate [Hz].
+        sensor_range: maximum distance of visible objects' centres [m].
+        min_visible: minimum unoccluded share of a visible object's angular width.
+        errors: detection errors; `DetectionErrors.none()` for perfect detectors.
 
     Raises:
         ValueError: a value out of its range, an unknown field, or fewer vehicles than agents.
@@ -61,14 +61,14 @@ class JunctionSettings(Settings):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AgentView:
-    """What one agent detected at one time, and the truth about it.
+    """Detections of one agent in one frame, with the ground truth.
 
     Attributes:
-        boxes: the detections with scores and labels, without track ids, in the agent's own LiDAR frame.
-        object_id: (M,) the true object of each detection, -1 for a false one.
-        visible: the true boxes of all objects that the agent could see, in its LiDAR frame; track_id is the object id.
-        world_SE2_agent: where the agent is.
-        own_id: the agent's object id: it does not see itself, but others see it.
+        boxes: the M detections with scores and labels, without track ids, in the agent's LiDAR frame.
+        object_id: (M,) object id of each detection, -1 for a false positive.
+        visible: true boxes of all visible objects in the agent's LiDAR frame; track_id is the object id.
+        world_SE2_agent: pose of the agent.
+        own_id: object id of the agent itself, which only other agents detect.
     """
 
     boxes: Boxes
@@ -85,8 +85,8 @@ class ObjectListFrame:
     Attributes:
         index: 0, 1, 2, …
         time: time stamp [s].
-        agents: what each agent saw, by its name.
-        objects: the true boxes of all vehicles in the world frame; track_id is the object id.
+        agents: views by agent name.
+        objects: true boxes of all vehicles in the world frame; track_id is the object id.
     """
 
     index: int
@@ -95,28 +95,28 @@ class ObjectListFrame:
     objects: Boxes
 
     def ego_SE2_other(self, ego: str, other: str) -> SE2:
-        """The true relative pose of two agents: maps the other's coordinates to the ego's."""
+        """True relative pose of two agents: maps the other's coordinates to the ego's."""
         return self.agents[ego].world_SE2_agent.inverse() @ self.agents[other].world_SE2_agent
 
     def matches(self, ego: str, other: str) -> IntArray:
-        """(K, 2) rows in the ego's and in the other's detections that are the same object, by the ego's row."""
+        """(K, 2) pairs of rows, in ego and in other, of detections of the same object, sorted by ego's row."""
         mine, theirs = self.agents[ego].object_id, self.agents[other].object_id
         same = (mine[:, None] == theirs[None, :]) & (mine >= 0)[:, None]
         return np.argwhere(same).astype(np.int64)
 
 
 class Junction:
-    """The scene: a sequence of `ObjectListFrame`.
+    """A simulated junction: a sequence of `ObjectListFrame`.
 
-    Same seed and settings, same bytes, in whatever order frames are asked for.
+    Seed and settings determine every frame, in any order of access.
 
     Attributes:
-        seed: a whole number >= 0.
-        settings: what the junction is like.
+        seed: integer >= 0.
+        settings: of the junction.
         traffic: the vehicles and their paths.
 
     Raises:
-        ValueError: the junction has no room for that many vehicles, or there are fewer vehicles than agents.
+        ValueError: too many vehicles for the junction, or fewer vehicles than agents.
     """
 
     def __init__(self, seed: int = 0, settings: JunctionSettings | None = None) -> None:
@@ -128,7 +128,7 @@ class Junction:
         self.traffic = place_traffic(settings.vehicles, settings.agents, settings.duration, rng)
 
     def __len__(self) -> int:
-        """How many frames the scene has."""
+        """Number of frames."""
         return max(1, round(self.settings.duration * self.settings.rate))
 
     def __iter__(self) -> Iterator[ObjectListFrame]:
@@ -139,7 +139,7 @@ class Junction:
         """The frame with this index, from 0.
 
         Raises:
-            IndexError: there is no such frame.
+            IndexError: index out of range.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a scene of {len(self)}")
@@ -150,12 +150,12 @@ class Junction:
         return ObjectListFrame(index=index, time=time, agents=agents, objects=objects)
 
     def _view(self, objects: Boxes, agent: int, index: int) -> AgentView:
-        """What the agent with this object id sees of `objects` (given in the world frame)."""
+        """View of the agent with this object id; `objects` are in the world frame."""
         world_SE2_agent = SE2(objects.center[agent, 0], objects.center[agent, 1], objects.yaw[agent])
         others = objects[np.arange(len(objects)) != agent].transform(world_SE2_agent.inverse())
         visible = others[is_visible(others, self.settings.sensor_range, self.settings.min_visible)]
         rng = np.random.default_rng([self.seed, _FIRST_DETECTION_STREAM + agent, index])
         boxes, rows = add_detection_errors(visible, self.settings.errors, rng)
         assert visible.track_id is not None
-        known = np.append(visible.track_id, -1)  # row -1, a false box, is object -1
-        return AgentView(boxes, known[rows], visible, world_SE2_agent, agent)
+        object_id = np.append(visible.track_id, -1)  # row -1, a false positive, is object -1
+        return AgentView(boxes, object_id[rows], visible, world_SE2_agent, agent)
