@@ -117,7 +117,7 @@ def test_workers_write_the_same_bytes(tree: Path, tmp_path: Path) -> None:
 def test_worker_error_is_raised_in_parent(tmp_path: Path) -> None:
     settings = ScenarioSettings(frames=2, agents=8, traffic=TrafficSettings(vehicles=1, warm_up=0.0))
     task = Task(0, SimulatedScenario(NETWORK, 1, settings))
-    with pytest.raises(ValueError, match="8 agents wanted"):
+    with pytest.raises(ValueError, match="8 agents requested"):
         export(OPV2VLayout(tmp_path, "test"), [task], workers=2, progress=lambda done, total: None)
 
 

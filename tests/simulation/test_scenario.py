@@ -203,7 +203,7 @@ def test_agents_are(what: str, rows: list[tuple[int, float, str, int]], chosen: 
 
 
 def test_too_few_vehicles_are_said_so() -> None:
-    with pytest.raises(ValueError, match="2 agents wanted, but only 1"):
+    with pytest.raises(ValueError, match="2 agents requested, but only 1"):
         _choose_agents(traffic([(1, 0.0, "suv", 3)]), ScenarioSettings(agents=2), np.random.default_rng(0))
 
 

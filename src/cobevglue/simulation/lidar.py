@@ -44,8 +44,8 @@ class LidarSettings(Settings):
         dropout_intensity: points below this intensity have an additional drop-out probability, which grows linearly …
         dropout_at_zero: … to this value at intensity 0.
         attenuation: decay of the intensity with distance [1/m]: exp(-attenuation * distance).
-        intensity: "distance": the same reflectivity for all surfaces, as in CARLA; "surface": the surface's reflectivity
-            and the angle of incidence.
+        intensity: "distance": the same reflectivity for all surfaces, as in CARLA; "surface": by the reflectivity and
+            the angle of incidence.
     """
 
     beams: Annotated[int, Field(ge=1, le=512)] = 64

@@ -70,8 +70,8 @@ class Mesh:
     def moved(self, xyz: ArrayLike, yaw: float = 0.0, scale: ArrayLike = 1.0) -> Mesh:
         """Scale about the origin, rotate about z by `yaw` [rad], then translate by `xyz` [m]."""
         c, s = np.cos(yaw), np.sin(yaw)
-        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        vertices = (self.vertices * np.asarray(scale, dtype=np.float64)) @ rotation.T + np.asarray(xyz, dtype=np.float64)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        vertices = (self.vertices * np.asarray(scale, dtype=np.float64)) @ turn.T + np.asarray(xyz, dtype=np.float64)
         return replace(self, vertices=vertices.astype(np.float32))
 
     def bounds(self) -> tuple[Float32Array, Float32Array]:

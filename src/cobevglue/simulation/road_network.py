@@ -1,11 +1,11 @@
-"""The road networks that come with the package, and their geometry: where lanes, junctions and roadsides are.
+"""The road networks shipped with the package, and the geometry of their lanes, junctions and roadsides.
 
     network = RoadNetwork.load("junction_train_0")
-    network.distance_to_road(points)      # 0 on the road, otherwise how far beside it
+    network.distance_to_road(points)      # 0 on the road
     network.roadside(spacing=6.0)         # points along the right edge of every road, for kerbs, poles, parked cars
 
-The world frame is right-handed, in metres, x east, y north, its origin in the middle of the network. The files are
-SUMO networks, made by `tools/build_networks.py`; reading them needs neither SUMO nor libsumo.
+The world frame is right-handed, in metres, x east, y north, with its origin at the centre of the network. The files are
+SUMO networks written by `tools/build_networks.py`; reading them requires neither SUMO nor libsumo.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ __all__ = [
 ]
 
 NETWORK_KINDS = ("junction", "t_junction", "roundabout", "highway", "residential", "town", "crossing")
-"""What kinds of network there are: signalised junction, T-junction, roundabout, highway with ramps, housing area,
-streets that cross each other, and the crossing of two wide ones."""
+"""Kinds of network: signalised junction, T-junction, roundabout, highway with ramps, residential area, street grid of
+a town, and the crossing of two wide roads."""
 
 _VARIANTS = {"train": 10, "validation": 1, "test": 2}
 _NOT_TESTED = ("crossing",)
-"""Kinds that came when results on the test networks had been published: those stay comparable."""
+"""Kinds added after results on the test networks were published, which have to stay comparable."""
 
 NETWORKS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -55,12 +55,12 @@ NETWORKS: MappingProxyType[str, tuple[str, ...]] = MappingProxyType(
         for split, count in _VARIANTS.items()
     }
 )
-"""The names of the stored networks by split. No network is in two splits."""
+"""Names of the stored networks by split; the splits are disjoint."""
 
 NETWORKS_FOLDER = Path(__file__).parent / "networks"
 
-_DEFAULT_LANE_WIDTH = 3.2  # SUMO's, where the file has none [m]
-_CELL = 16.0  # points of one such square are compared with the same few segments [m]
+_DEFAULT_LANE_WIDTH = 3.2  # SUMO's default [m]
+_CELL = 16.0  # side of the squares whose points share the candidate segments of a distance query [m]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,13 +68,13 @@ class Lane:
     """One lane, in its driving direction.
 
     Attributes:
-        id: SUMO's name of it.
-        edge: the directed road that it belongs to.
+        id: SUMO's id.
+        edge: id of its directed road.
         index: 0 is the rightmost lane of its edge.
         centerline: (N, 2) points [m].
         width: [m].
         speed_limit: [m/s].
-        internal: whether it only leads over a junction.
+        internal: whether it lies within a junction.
     """
 
     id: str
@@ -93,12 +93,12 @@ class Lane:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Junction:
-    """Where roads meet.
+    """A junction of roads.
 
     Attributes:
-        id: SUMO's name of it.
+        id: SUMO's id.
         kind: SUMO's type: "traffic_light", "priority", "right_before_left", …
-        polygon: (N, 2) its outline [m].
+        polygon: (N, 2) outline [m].
     """
 
     id: str
@@ -112,8 +112,8 @@ class Roadside:
 
     Attributes:
         xy: (K, 2) points [m].
-        yaw: (K,) the driving direction there [rad]; the road is on its left.
-        edge: (K,) the directed road.
+        yaw: (K,) driving direction [rad]; the road is on its left.
+        edge: (K,) id of the directed road.
     """
 
     xy: FloatArray
@@ -123,13 +123,13 @@ class Roadside:
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """A network's geometry in the world frame.
+    """Geometry of a road network in the world frame.
 
     Attributes:
         name: as in `NETWORKS`.
-        lanes: all lanes, those over junctions too.
-        junctions: all junctions that have an area.
-        routes: the edges of the way from every road that enters the network to every one that leaves it.
+        lanes: all lanes, including those within junctions.
+        junctions: all junctions with an area.
+        routes: edges of the shortest route from every entry of the network to every reachable exit.
     """
 
     name: str
@@ -139,10 +139,10 @@ class RoadNetwork:
 
     @classmethod
     def load(cls, name: str) -> RoadNetwork:
-        """A stored network by its name.
+        """Load a stored network by name.
 
         Raises:
-            ValueError: there is none of this name; the message has the nearest one.
+            ValueError: unknown name; the message suggests the nearest one.
         """
         with gzip.open(network_file(name)) as file:
             root = ElementTree.parse(file).getroot()
@@ -168,7 +168,7 @@ class RoadNetwork:
         return float(x_min), float(y_min), float(x_max), float(y_max)
 
     def distance_to_road(self, points: ArrayLike) -> FloatArray:
-        """(M,) how far points (M, 2) are from the nearest road surface [m]; 0 on it."""
+        """(M,) distance of points (M, 2) from the nearest road surface [m]; 0 on it."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         distance = np.empty(len(points))
         if not len(points):
@@ -176,11 +176,11 @@ class RoadNetwork:
         segments = self._segments
         cells, member = np.unique(np.floor(points / _CELL), axis=0, return_inverse=True)
         from_centre = _distances((cells + 0.5) * _CELL, segments)
-        # No point of a cell is farther than half its diagonal from its centre: only these can be nearest to one.
+        # Points of a cell are at most half its diagonal from its centre: only these segments can be the nearest.
         eligible = from_centre <= from_centre.min(axis=1, keepdims=True) + math.sqrt(2.0) * _CELL
         order = np.argsort(member.ravel(), kind="stable")
-        for rows, few in zip(np.split(order, np.cumsum(np.bincount(member.ravel()))[:-1]), eligible, strict=True):
-            distance[rows] = _distances(points[rows], segments[few]).min(axis=1)
+        for rows, near in zip(np.split(order, np.cumsum(np.bincount(member.ravel()))[:-1]), eligible, strict=True):
+            distance[rows] = _distances(points[rows], segments[near]).min(axis=1)
         for junction in self.junctions:
             low, high = junction.polygon.min(axis=0), junction.polygon.max(axis=0)
             about = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
@@ -188,11 +188,14 @@ class RoadNetwork:
         return np.maximum(distance, 0.0)
 
     def roadside(self, spacing: float, offset: float = 0.0) -> Roadside:
-        """Points along the right edge of every road but not of junctions.
+        """Points along the right edge of every road, without junctions.
 
         Args:
             spacing: between neighbours along a road [m].
-            offset: how far to the right of the road's edge [m]; negative is on the road.
+            offset: distance to the right of the road's edge [m]; negative on the road.
+
+        Raises:
+            ValueError: `spacing` is not positive.
         """
         if not spacing > 0:
             raise ValueError(f"spacing must be > 0, got {spacing}")
@@ -209,7 +212,7 @@ class RoadNetwork:
 
     @cached_property
     def _segments(self) -> FloatArray:
-        """(S, 5) start, step and half width of lane pieces and, without width, of junction outlines."""
+        """(S, 5) start, direction vector and half width of lane segments and of junction outlines (half width 0)."""
         lines = [(lane.centerline, lane.width / 2) for lane in self.lanes]
         lines += [(np.vstack([junction.polygon, junction.polygon[:1]]), 0.0) for junction in self.junctions]
         return np.concatenate(
@@ -218,10 +221,10 @@ class RoadNetwork:
 
 
 def network_file(name: str) -> Path:
-    """Where a stored network is.
+    """Path of a stored network.
 
     Raises:
-        ValueError: there is none of this name; the message has the nearest one.
+        ValueError: unknown name; the message suggests the nearest one.
     """
     names = [known for split in NETWORKS.values() for known in split]
     if name not in names:
@@ -242,7 +245,7 @@ def _lane(edge: ElementTree.Element, lane: ElementTree.Element) -> Lane:
 
 
 def _routes(root: ElementTree.Element) -> Iterator[tuple[str, ...]]:
-    """The ways with the fewest edges through a network, from every edge that nothing leads to."""
+    """Routes with the fewest edges from every edge without predecessor to every reachable edge without successor."""
     following: dict[str, list[str]] = {
         edge.attrib["id"]: [] for edge in root.iter("edge") if edge.get("function") != "internal"
     }
@@ -268,7 +271,7 @@ def _points(shape: str) -> FloatArray:
 
 
 def _sample(line: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
-    """(K, 2) points every so many metres along a line, half a spacing from its start, and its (K,) headings there."""
+    """(K, 2) equidistant points along a line, the first half a spacing from its start, and (K,) headings [rad]."""
     step = np.diff(line, axis=0)
     length = np.r_[0.0, np.cumsum(np.hypot(*step.T))]
     at = np.arange(spacing / 2, length[-1], spacing)
@@ -278,7 +281,7 @@ def _sample(line: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _distances(points: FloatArray, segments: FloatArray) -> FloatArray:
-    """(M, S) how far points (M, 2) are outside of segments (S, 5) with a width; negative inside."""
+    """(M, S) signed distances [m] of points (M, 2) from segments (S, 5) with a width; negative inside."""
     step_x, step_y = segments[:, 2], segments[:, 3]
     x, y = (points[:, None, axis] - segments[None, :, axis] for axis in (0, 1))
     share = np.clip((x * step_x + y * step_y) / np.maximum(step_x**2 + step_y**2, 1e-12), 0.0, 1.0)
@@ -287,7 +290,7 @@ def _distances(points: FloatArray, segments: FloatArray) -> FloatArray:
 
 
 def _inside(points: FloatArray, polygon: FloatArray) -> BoolArray:
-    """(M,) whether points are in a polygon: a ray to the right crosses its outline an odd number of times."""
+    """(M,) whether points (M, 2) are inside a polygon, by the even-odd rule."""
     inside = np.zeros(len(points), dtype=np.bool_)
     x, y = points.T
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):

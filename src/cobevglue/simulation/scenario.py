@@ -1,12 +1,11 @@
-"""A drive that several agents see: SUMO traffic on a stored network, every agent's cloud, and the exact truth.
+"""Simulated scenarios with several agents: SUMO traffic on a stored network, LiDAR clouds and exact ground truth.
 
     for scenario in simulated_scenarios("test", count=4, seed=0):
-        for frame in scenario:                                # as of any data set
+        for frame in scenario:                                # as in any data set
             frame.agents["car1"].points, frame.ground_truth("car1")
-        scenario.views(0)["car1"].point_count                 # and how many points lie on each object
+        scenario.views(0)["car1"].point_count                 # number of points on each object
 
-The traffic is run once, when a scenario is first used; its frames can then be asked for in any order, and any frame is
-the same bytes whatever was asked for before.
+Traffic is simulated once, on first use. Frames do not depend on the order of access.
 """
 
 from __future__ import annotations
@@ -30,28 +29,28 @@ from cobevglue.typing import BoolArray, FloatArray, IntArray
 __all__ = ["ScenarioSettings", "SimulatedScenario", "simulated_scenario", "simulated_scenarios", "split_of"]
 
 _SCENARIO_STREAM, _AGENT_STREAM, _MOUNT_STREAM = 60, 61, 62
-_STEPS_PER_SECOND = 10  # of the traffic
-_NUMBER_STEP = 2  # OPV2V counts simulation steps of 0.05 s
+_STEPS_PER_SECOND = 10  # of the traffic simulation
+_NUMBER_STEP = 2  # OPV2V numbers frames by simulation steps of 0.05 s
 _AGENT_KINDS = ("sedan", "hatchback", "coupe", "suv")
-"""What carries a sensor as OPV2V's cars do, 1.9 m above the ground."""
+"""Kinds of vehicle that carry a sensor, 1.9 m above the ground as in OPV2V."""
 _SPARE_AGENT_KINDS = (*_AGENT_KINDS, "jeep", "pickup", "van", "truck", "bus")
-"""What carries one if there are too few of these."""
-_AROUND = 50.0
-"""Agents are rather those that have many others within this distance [m]."""
+"""Kinds used if too few of these stay for the whole scenario."""
+_NEIGHBOUR_RADIUS = 50.0
+"""Agents are drawn in proportion to the number of vehicles within this distance [m]."""
 _DRAWS = 30
 
 
 class ScenarioSettings(Settings):
-    """What a drive is like.
+    """Settings of a simulated scenario.
 
     Attributes:
-        frames: how many.
-        rate: frames a second [Hz]; a tenth of a second is a whole number of times between two of them.
-        agents: how many vehicles carry a sensor: "car1", "car2", …
-        roadside_units: how many sensors stand on masts beside the road: "-1", "-2", …, as in V2XSet.
-        lidar: the vehicles' sensor by its name in `LIDARS`; roadside units have the one called "roadside".
-        max_distance: agents are at most this far from each other in the middle of the drive [m], if there are such.
-        traffic: how much traffic there is.
+        frames: number of frames.
+        rate: frame rate [Hz]; 1 / rate is a multiple of 0.1 s.
+        agents: number of vehicles with a sensor: "car1", "car2", …
+        roadside_units: number of sensors on masts beside the road: "-1", "-2", …, as in V2XSet.
+        lidar: name of the vehicles' sensor in `LIDARS`; roadside units use "roadside".
+        max_distance: maximum distance between agents in the middle frame [m], where possible.
+        traffic: settings of the traffic.
 
     Raises:
         ValueError: a value out of its range, or an unknown field.
@@ -77,26 +76,26 @@ class ScenarioSettings(Settings):
     @classmethod
     def _known_lidar(cls, lidar: str) -> str:
         if lidar not in LIDARS:
-            raise ValueError(f"lidar: no sensor {lidar!r}; there are: {', '.join(LIDARS)}")
+            raise ValueError(f"lidar: no sensor {lidar!r}; known: {', '.join(LIDARS)}")
         return lidar
 
 
 class SimulatedScenario(Scenario):
-    """The frames of one drive, made when they are asked for. Same network, seed and settings: same bytes.
+    """One simulated scenario; frames are computed on access and determined by network, seed and settings.
 
-    As in OPV2V, clouds keep the points on the agent's own body, and an agent's objects are the vehicles, moving and
-    parked, that at least one of its points lies on, itself excluded; ids hold for all agents and frames.
+    As in OPV2V, clouds contain the points on the agent's own body, and an agent's objects are the moving and parked
+    vehicles with at least one of its points, itself excluded; ids are the same for all agents and frames.
 
     Attributes:
         name: of the scenario.
         network: name of the road network.
-        seed: of the world and its traffic, a whole number >= 0.
-        settings: what the drive is like.
+        seed: of the world and its traffic, an integer >= 0.
+        settings: of the scenario.
 
     Raises:
-        ValueError: there is no such network; the message has the nearest one. Or, when first used: not enough vehicles
-            can carry a sensor.
-        ModuleNotFoundError: when first used: libsumo, embreex or trimesh is not installed.
+        ValueError: unknown network; the message suggests the nearest one. On first use: too few vehicles can carry a
+            sensor.
+        ModuleNotFoundError: on first use: libsumo, embreex or trimesh is not installed.
     """
 
     def __init__(
@@ -109,12 +108,12 @@ class SimulatedScenario(Scenario):
         super().__init__(name or f"{network}_{seed}", self.settings.frames, self._frame)
 
     def __reduce__(self) -> tuple[type[SimulatedScenario], tuple[str, int, ScenarioSettings, str]]:
-        # What was computed is not pickled: another process makes the same.
+        # Cached results are not pickled: other processes recompute them.
         return type(self), (self.network, self.seed, self.settings, self.name)
 
     @cached_property
     def traffic(self) -> tuple[TrafficSnapshot, ...]:
-        """The vehicles of every frame, in the world frame."""
+        """Vehicles of every frame, in the world frame."""
         settings = self.settings
         snapshots = []
         with Traffic(self.network, self.seed, settings.traffic) as traffic:
@@ -126,9 +125,9 @@ class SimulatedScenario(Scenario):
 
     @cached_property
     def carriers(self) -> dict[str, int]:
-        """Who carries the sensor of each agent: a vehicle's id; -1, -2, … for roadside units, which come last.
+        """Vehicle id of each agent by name; -1, -2, … for roadside units, which are last.
 
-        The names of vehicles are in the order of their ids as text, so that files named by id are in this order too.
+        Agents are numbered in the order of their vehicle ids as strings, which is the order of folders named by id.
         """
         rng = np.random.default_rng([self.seed, _AGENT_STREAM, 0])
         try:
@@ -140,16 +139,14 @@ class SimulatedScenario(Scenario):
 
     @cached_property
     def world(self) -> World:
-        """All that stands still."""
+        """The static world."""
         return World(self.network, self.seed)
 
     def views(self, index: int) -> dict[str, LidarView]:
-        """What every agent sees in a frame, by the agent's name, with the number of points on each object.
-
-        An agent that is not on the network in this frame is left out.
+        """Views of a frame by agent name, without agents that are not on the network in this frame.
 
         Raises:
-            IndexError: there is no such frame.
+            IndexError: index out of range.
         """
         settings, snapshot = self.settings, self.traffic[index]
         index = range(len(self))[index]
@@ -160,7 +157,7 @@ class SimulatedScenario(Scenario):
                 sensors.append((self._masts[name], -1))
                 lidars.append(LIDARS["roadside"])
             elif carrier in snapshot.id:
-                # The mount leans the same in all frames.
+                # The mount has the same tilt in all frames.
                 mount = np.random.default_rng([self.seed, _MOUNT_STREAM, carrier])
                 lidar = LIDARS[settings.lidar]
                 sensors.append((now.sensor_on_vehicle(carrier, lidar, mount), carrier))
@@ -171,12 +168,12 @@ class SimulatedScenario(Scenario):
         return dict(zip(names, now.views(sensors, lidars, index), strict=True))
 
     def timestamp(self, index: int) -> str:
-        """The name of a frame: OPV2V's numbering by steps of 0.05 s, for 10 Hz."""
+        """Name of a frame in OPV2V's numbering by steps of 0.05 s, for 10 Hz."""
         return f"{_NUMBER_STEP * index:06d}"
 
     @cached_property
     def _masts(self) -> dict[str, FloatArray]:
-        """(4, 4) pose of every roadside unit's sensor, by its name."""
+        """(4, 4) sensor pose of each roadside unit by name."""
         middle = self.traffic[len(self) // 2]
         xy = np.column_stack([middle.x, middle.y])
         agents = xy[np.isin(middle.id, list(self.carriers.values()))]
@@ -201,17 +198,17 @@ class SimulatedScenario(Scenario):
 def simulated_scenario(
     split: str, number: int, seed: int = 0, settings: ScenarioSettings | None = None, network: str | None = None
 ) -> SimulatedScenario:
-    """Scenario `number`, from 0, of a split: on the split's networks in turn, each time another world.
+    """Scenario `number` of a split: its networks are used in turn, each time with a new world.
 
     Args:
         split: "train", "validation" or "test".
-        number: of the scenario.
-        seed: of the whole split.
-        settings: what the drive is like.
-        network: the network; None for the next of the split.
+        number: index of the scenario, from 0.
+        seed: of the split.
+        settings: of the scenario.
+        network: name of the network; None for the split's networks in turn.
 
     Raises:
-        ValueError: no such split or network.
+        ValueError: unknown split or network.
     """
     if split not in NETWORKS:
         raise ValueError(f"split must be one of {', '.join(NETWORKS)}, got {split!r}")
@@ -224,26 +221,26 @@ def simulated_scenario(
 def simulated_scenarios(
     split: str, count: int, seed: int = 0, settings: ScenarioSettings | None = None
 ) -> Iterator[SimulatedScenario]:
-    """The first `count` scenarios of a split, one after the other: each is large once it was used.
+    """Iterate over the first `count` scenarios of a split; each caches its world and traffic once used.
 
     Args:
-        split: "train", "validation" or "test"; no network is in two of them.
-        count: how many.
+        split: "train", "validation" or "test"; their networks are disjoint.
+        count: number of scenarios.
         seed: of the split.
-        settings: what the drives are like.
+        settings: of the scenarios.
 
     Raises:
-        ValueError: no such split.
+        ValueError: unknown split.
     """
     simulated_scenario(split, 0, seed, settings)
     return (simulated_scenario(split, number, seed, settings) for number in range(count))
 
 
 def split_of(network: str) -> str:
-    """The split that a network belongs to.
+    """The split of a network.
 
     Raises:
-        ValueError: there is no such network; the message has the nearest one.
+        ValueError: unknown network; the message suggests the nearest one.
     """
     network_file(network)
     return next(split for split, names in NETWORKS.items() if network in names)
@@ -260,41 +257,41 @@ def _agent_frame(views: Callable[[], Mapping[str, LidarView]], name: str, is_inf
 def _choose_agents(
     traffic: Sequence[TrafficSnapshot], settings: ScenarioSettings, rng: np.random.Generator
 ) -> list[int]:
-    """Ids of vehicles that are there in all frames, near each other in the middle of the drive, others around them.
+    """Ids of vehicles present in all frames, near each other and with many neighbours in the middle frame.
 
-    Where fewer stay, those that stay longest.
+    If too few are, the vehicles present in most frames.
     """
     middle = traffic[len(traffic) // 2]
     ids, frames = np.unique(np.concatenate([snapshot.id for snapshot in traffic]), return_counts=True)
-    stays = frames[np.searchsorted(ids, middle.id)]
-    able = _able(middle, stays, settings.agents)
+    presence = frames[np.searchsorted(ids, middle.id)]
+    eligible = _eligible(middle, presence, settings.agents)
     xy = np.column_stack([middle.x, middle.y])
     distance = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
-    weight = (distance[able] < _AROUND).sum(axis=1).astype(np.float64)
-    apart = distance[np.ix_(able, able)]
+    weight = (distance[eligible] < _NEIGHBOUR_RADIUS).sum(axis=1).astype(np.float64)
+    apart = distance[np.ix_(eligible, eligible)]
     draws = [_draw(apart, weight, settings, rng) for _ in range(_DRAWS)]
     widest = [apart[np.ix_(rows, rows)].max() for rows in draws]
     near = next((i for i, width in enumerate(widest) if width <= settings.max_distance), int(np.argmin(widest)))
-    chosen: list[int] = middle.id[able[draws[near]]].tolist()
+    chosen: list[int] = middle.id[eligible[draws[near]]].tolist()
     return chosen
 
 
-def _able(middle: TrafficSnapshot, stays: IntArray, wanted: int) -> IntArray:
-    """Rows of the vehicles to choose from."""
+def _eligible(middle: TrafficSnapshot, presence: IntArray, count: int) -> IntArray:
+    """Rows of the vehicles that can be agents; `presence` is the number of frames of each."""
     usual, spare = (np.isin(middle.kind, kinds) for kinds in (_AGENT_KINDS, _SPARE_AGENT_KINDS))
-    choices: list[BoolArray] = [kinds & (stays == stays.max()) for kinds in (usual, spare)]
+    choices: list[BoolArray] = [kinds & (presence == presence.max()) for kinds in (usual, spare)]
     for choice in choices:
-        if choice.sum() >= wanted:
+        if choice.sum() >= count:
             return np.flatnonzero(choice)
     rows = np.flatnonzero(spare)
-    if len(rows) < wanted:
-        raise ValueError(f"{wanted} agents wanted, but only {len(rows)} vehicles can carry a sensor")
-    longest: IntArray = rows[np.argsort(-stays[rows], kind="stable")[:wanted]]
+    if len(rows) < count:
+        raise ValueError(f"{count} agents requested, but only {len(rows)} vehicles can carry a sensor")
+    longest: IntArray = rows[np.argsort(-presence[rows], kind="stable")[:count]]
     return longest
 
 
 def _draw(apart: FloatArray, weight: FloatArray, settings: ScenarioSettings, rng: np.random.Generator) -> IntArray:
-    """Rows of one agent and of others near it, drawn by weight; of any others if too few are near."""
+    """Rows of one agent and of others near it, drawn by weight; the nearest ones if too few are within range."""
     first = int(rng.choice(len(weight), p=weight / weight.sum()))
     others = np.flatnonzero(apart[first] <= settings.max_distance)
     if len(others) < settings.agents:

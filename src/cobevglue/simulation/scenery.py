@@ -1,6 +1,6 @@
-"""What stands beside the roads: uneven ground, kerbs, buildings, walls, poles, trees, furniture, parked vehicles.
+"""Static surroundings of roads: uneven ground, kerbs, buildings, walls, poles, trees, furniture, parked vehicles.
 
-Each world draws its own character: how built-up it is, how green, how hilly, how many vehicles park.
+The densities of buildings, vegetation and parked vehicles and the slope of the ground are random per world.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from cobevglue.typing import ArrayLike, FloatArray
 __all__ = ["Ground", "ParkedVehicle", "Scenery", "build_scenery"]
 
 _MARGIN = 70.0
-"""The ground goes on this far beyond the roads [m]."""
+"""Width of the ground beyond the roads [m]."""
 _GROUND_CELL = 6.0
 _KERB_STEP = 4.0
 
 _CAR_KINDS = ("hatchback", "sedan", "suv", "coupe", "jeep", "pickup", "van")
 _CAR_SHARES = (0.28, 0.27, 0.2, 0.08, 0.06, 0.05, 0.06)
-_CAR_SIZES = {  # length, width over the mirrors, height: lowest and highest [m]
+_CAR_SIZES = {  # minimum and maximum of length, width over the mirrors, height [m]
     "hatchback": ((3.5, 1.75, 1.42), (4.3, 2.05, 1.65)),
     "sedan": ((4.4, 1.95, 1.38), (5.4, 2.2, 1.58)),
     "suv": ((4.2, 1.95, 1.55), (5.1, 2.25, 1.9)),
@@ -35,12 +35,12 @@ _CAR_SIZES = {  # length, width over the mirrors, height: lowest and highest [m]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ground:
-    """Gently rolling ground, a sum of waves.
+    """Gently rolling ground: a sum of sine waves.
 
     Attributes:
         wave: (W, 2) wave vectors [rad/m].
-        phase: (W,) [rad].
-        amplitude: (W,) [m].
+        phase: (W,) phases [rad].
+        amplitude: (W,) amplitudes [m].
     """
 
     wave: FloatArray
@@ -49,7 +49,7 @@ class Ground:
 
     @staticmethod
     def random(rng: np.random.Generator) -> Ground:
-        """From flat to slopes of some per cent."""
+        """Random ground, from flat to slopes of a few per cent."""
         length, direction = rng.uniform(60.0, 250.0, size=4), rng.uniform(0.0, 2 * np.pi, size=4)
         wave = (2 * np.pi / length)[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
         steepness = rng.choice([0.0, 0.004, 0.012, 0.02])
@@ -68,7 +68,7 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class ParkedVehicle:
-    """A vehicle that stands still: where [m, rad], of what kind and size (length, width, height) [m]."""
+    """A parked vehicle: position [m], heading [rad], kind and size (length, width, height) [m]."""
 
     x: float
     y: float
@@ -79,12 +79,12 @@ class ParkedVehicle:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scenery:
-    """All that does not move.
+    """The static surroundings of roads.
 
     Attributes:
-        ground: its height.
-        mesh: everything but vehicles, in the world frame.
-        parked: vehicles that stand beside the roads and on car parks.
+        ground: height of the ground.
+        mesh: everything except vehicles, in the world frame.
+        parked: vehicles beside the roads and on car parks.
     """
 
     ground: Ground
@@ -93,7 +93,7 @@ class Scenery:
 
 
 def build_scenery(roads: RoadNetwork, rng: np.random.Generator) -> Scenery:
-    """A random surrounding for a road network."""
+    """Random surroundings of a road network."""
     return _Builder(roads, rng).build()
 
 
@@ -103,7 +103,7 @@ class _Builder:
     rng: np.random.Generator
     parts: list[Mesh] = field(default_factory=list)
     parked: list[ParkedVehicle] = field(default_factory=list)
-    taken: list[tuple[float, float, float]] = field(default_factory=list)  # discs: x, y, radius
+    occupied: list[tuple[float, float, float]] = field(default_factory=list)  # discs: x, y, radius
 
     def build(self) -> Scenery:
         rng = self.rng
@@ -114,27 +114,27 @@ class _Builder:
         if self.roads.kind == "residential":
             parking = max(parking, 0.25)
         wide = self.roads.kind in ("town", "crossing")
-        nobody_parks = self.roads.kind == "highway" or (wide and rng.random() < 0.5)
+        no_parking = self.roads.kind == "highway" or (wide and rng.random() < 0.5)
         self._lay_ground()
         pavement = float(rng.uniform(1.2, 4.5))
         if self.roads.kind != "highway" or rng.random() < 0.3:
             self._lay_kerbs(float(rng.uniform(0.06, 0.22)), pavement)
         else:
             self._guard_rails()
-        self._park_along(0.0 if nobody_parks else parking)
+        self._park_along(0.0 if no_parking else parking)
         self._buildings(built_up, pavement)
-        self._car_parks(0 if nobody_parks else int(rng.integers(0, 4)))
+        self._car_parks(0 if no_parking else int(rng.integers(0, 4)))
         self._walls(built_up)
         self._street_furniture(pavement, built_up)
         self._trees(green, pavement)
         return Scenery(self.ground, Mesh.concatenate(self.parts), tuple(self.parked))
 
-    # ---- where there is room
+    # ---- free space
 
     def _free(self, x: float, y: float, radius: float) -> bool:
-        if not self.taken:
+        if not self.occupied:
             return True
-        discs = np.array(self.taken)
+        discs = np.array(self.occupied)
         return bool((np.hypot(discs[:, 0] - x, discs[:, 1] - y) > discs[:, 2] + radius).all())
 
     def _off_road(self, corners: FloatArray, clearance: float) -> bool:
@@ -144,7 +144,7 @@ class _Builder:
         return float(self.ground.height([[x, y]])[0])
 
     def _beside_roads(self, spacing: float, low: float, high: float) -> FloatArray:
-        """(K, 3) x, y, yaw of places this far [m] to the right of road edges, not on any road, in random order."""
+        """(K, 3) x, y, yaw of places `low` to `high` [m] right of road edges, off all roads, in random order."""
         side = self.roads.roadside(spacing)
         if not len(side.xy):
             return np.zeros((0, 3))
@@ -172,7 +172,7 @@ class _Builder:
         self.parts.append(quads(faces, 0.25))
 
     def _lay_kerbs(self, height: float, width: float) -> None:
-        """Kerb stones and the pavement behind them, piece by piece along the roads."""
+        """Kerb stones and pavement slabs along the roads."""
         near = self.roads.roadside(_KERB_STEP, 0.05)
         far = self.roads.roadside(_KERB_STEP, width)
         if len(near.xy) < 2:
@@ -199,14 +199,14 @@ class _Builder:
         for x, y, z in base[:-1][joined]:
             self.parts.append(box((x, y, z + 0.35), (0.1, 0.1, 0.7), reflectivity=0.6))
 
-    # ---- vehicles that stand
+    # ---- parked vehicles
 
     def _car(self, x: float, y: float, yaw: float) -> None:
         kind = str(self.rng.choice(_CAR_KINDS, p=_CAR_SHARES))
         low, high = _CAR_SIZES[kind]
         length, width, height = self.rng.uniform(low, high)
         self.parked.append(ParkedVehicle(x, y, yaw, kind, (float(length), float(width), float(height))))
-        self.taken.append((x, y, float(length) / 2))
+        self.occupied.append((x, y, float(length) / 2))
 
     def _park_along(self, share: float) -> None:
         rng = self.rng
@@ -232,14 +232,14 @@ class _Builder:
                     py = float(y + along * np.sin(angle) + across * np.cos(angle))
                     if rng.random() < fill and self._off_road(np.array([[px, py]]), 3.5):
                         blocked = any(
-                            radius > 3.5 and np.hypot(tx - px, ty - py) < radius + 2.0 for tx, ty, radius in self.taken
+                            radius > 3.5 and np.hypot(tx - px, ty - py) < radius + 2.0 for tx, ty, radius in self.occupied
                         )
                         near = any(np.hypot(car.x - px, car.y - py) < (2.5 if slant else 6.0) for car in self.parked)
                         if not blocked and not near:
                             flip = np.pi if rng.random() < 0.5 else 0.0
                             self._car(px, py, float(angle + slant + flip + rng.normal(scale=0.03)))
 
-    # ---- what is built
+    # ---- buildings, walls, furniture, trees
 
     def _buildings(self, density: float, pavement: float) -> None:
         rng = self.rng
@@ -255,10 +255,10 @@ class _Builder:
             if not (self._off_road(outline, pavement) and self._free(cx, cy, 0.8 * radius)):
                 continue
             z = self._z(cx, cy)
-            self.taken.append((cx, cy, 0.8 * radius))
+            self.occupied.append((cx, cy, 0.8 * radius))
             shade = float(rng.uniform(0.2, 0.8))
             self.parts.append(box((cx, cy, z + height / 2 - 1), (width, depth, height + 2), angle, shade))
-            for _ in range(int(rng.integers(0, 5))):  # bays, steps, porches, columns on the side of the road
+            for _ in range(int(rng.integers(0, 5))):  # bays, steps, porches, columns on the side facing the road
                 along, out = rng.uniform(-width / 2, width / 2), depth / 2 + rng.uniform(0.0, 0.6)
                 size = (rng.uniform(0.4, 5.0), rng.uniform(0.3, 1.6), rng.uniform(0.3, 3.0))
                 px, py = (
@@ -296,7 +296,7 @@ class _Builder:
             if what in ("pole", "light"):
                 height = rng.uniform(3.0, 8.0)
                 self.parts.append(cylinder((x, y, z + height / 2), rng.uniform(0.05, 0.22), height, 0.5))
-                if what == "light":  # an arm over the road; its head is above what most sensors see
+                if what == "light":  # an arm over the road; its head is above the field of view of most sensors
                     reach = rng.uniform(1.5, 5.0)
                     center = (x - reach / 2 * np.sin(yaw), y + reach / 2 * np.cos(yaw), z + height - 0.2)
                     self.parts.append(box(center, (0.15, reach, 0.15), yaw, 0.5))

@@ -1,4 +1,4 @@
-"""Traffic on a stored road network, driven by SUMO: who is where, step by step.
+"""Traffic on a stored road network, simulated with SUMO.
 
     with Traffic("junction_train_0", seed=1) as traffic:
         for _ in range(100):
@@ -6,8 +6,8 @@
             now = traffic.vehicles()
             now.x, now.y, now.yaw, now.length      # boxes on the ground, world frame
 
-SUMO follows, queues, yields, changes lanes. Needs libsumo (`pip install cobevglue[simulation]`), which holds one
-simulation a process; hence one open `Traffic` at a time.
+SUMO models car following, queues, right of way and lane changes. Requires libsumo (`pip install
+cobevglue[simulation]`), which supports one simulation per process; hence one open `Traffic` at a time.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from cobevglue.typing import FloatArray, IntArray, StrArray
 __all__ = ["VEHICLE_KINDS", "Traffic", "TrafficSettings", "TrafficSnapshot"]
 
 _TRAFFIC_STREAM = 0
-_STEP = 0.1  # how finely SUMO moves vehicles [s]
-_STEPS_PER_DEMAND = 5  # steps after which vehicles are added in place of those that left
-_SPACE_PER_VEHICLE = 13.0  # of lane; denser than this nothing moves [m]
-_EDGE_MARGIN = 0.15  # vehicles beside the middle of their lane keep at least this far from its edge [m]
-_LATERAL_RESOLUTION = 0.8  # SUMO lets vehicles be anywhere in a lane, and cross lines slowly, if it has one [m]
-_PATIENCE = 2.0  # a vehicle that finds no room where it should appear is given up after this time [s]
+_STEP = 0.1  # SUMO's time step [s]
+_STEPS_PER_DEMAND = 5  # steps between replacements of departed vehicles
+_SPACE_PER_VEHICLE = 13.0  # minimum lane length per vehicle: denser traffic jams [m]
+_EDGE_MARGIN = 0.15  # minimum distance of vehicles with a lateral offset from the lane's edge [m]
+_LATERAL_RESOLUTION = 0.8  # enables SUMO's sublane model: lateral offsets and gradual lane changes [m]
+_MAX_DEPART_DELAY = 2.0  # vehicles that cannot be inserted are discarded after this time [s]
 
 
 class _Kind(NamedTuple):
-    """What vehicles of a kind are like: ranges of the dimensions [m], SUMO's class and how they drive."""
+    """A kind of vehicle: share, ranges of its dimensions [m], SUMO's class and limits of its motion."""
 
     share: float
     length: tuple[float, float]
@@ -69,11 +69,11 @@ _KINDS = MappingProxyType(
 )
 
 VEHICLE_KINDS = tuple(_KINDS)
-"""What kinds of vehicle there are."""
+"""Kinds of vehicle."""
 
-_IN_HOUSING = MappingProxyType({"truck": 0.3, "bus": 0.3})  # how much rarer these are in a housing area
+_RESIDENTIAL_FACTORS = MappingProxyType({"truck": 0.3, "bus": 0.3})  # of their shares in a residential area
 
-# How fast traffic flows, as a share of the speed limits, and how many vehicles there are per 100 m of lane.
+# Ranges of the speed, relative to the speed limits, and of the number of vehicles per 100 m of lane.
 _FLOW = MappingProxyType(
     {
         "junction": ((0.8, 1.1), (1.2, 4.2)),
@@ -91,13 +91,13 @@ _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class TrafficSettings(Settings):
-    """How much traffic there is.
+    """Settings of the traffic.
 
     Attributes:
-        vehicles: how many vehicles SUMO tries to keep on the network; None draws it, from light traffic to queues.
-        speed_factor: speed limits are multiplied by this; None draws it. A slow highway is a full one.
-        warm_up: how long traffic runs before the scene begins [s].
-        lateral_offset: how far vehicles drive beside the middle of their lane at most, if the lane is wide enough [m].
+        vehicles: target number of vehicles on the network; None: random, from light traffic to queues.
+        speed_factor: factor of the speed limits; None: random. Low values congest highways.
+        warm_up: simulated time before the scene begins [s].
+        lateral_offset: maximum offset of vehicles from the centre of their lane, where it is wide enough [m].
 
     Raises:
         ValueError: a value out of its range, or an unknown field.
@@ -115,13 +115,13 @@ class TrafficSnapshot:
 
     Attributes:
         time: since the scene began [s].
-        id: (N,) who it is: the same number as long as the vehicle is on the network, never given twice.
+        id: (N,) unique id, constant while the vehicle is on the network and never reused.
         kind: (N,) one of `VEHICLE_KINDS`.
         length: (N,) [m].
-        width: (N,) with mirrors [m].
+        width: (N,) over the mirrors [m].
         height: (N,) above the ground [m].
-        x: (N,) the box's centre [m].
-        y: (N,) the box's centre [m].
+        x: (N,) centre of the box [m].
+        y: (N,) centre of the box [m].
         yaw: (N,) heading from x towards y [rad].
         speed: (N,) [m/s].
     """
@@ -141,7 +141,7 @@ class TrafficSnapshot:
         return len(self.id)
 
     def boxes(self) -> Boxes:
-        """The vehicles as boxes standing on z = 0, with track ids and labels."""
+        """The vehicles as boxes on the plane z = 0, with track ids and labels."""
         return Boxes(
             center=np.column_stack([self.x, self.y, self.height / 2]),
             size=np.column_stack([self.length, self.width, self.height]),
@@ -152,24 +152,24 @@ class TrafficSnapshot:
 
 
 class _Vehicle(NamedTuple):
-    """What SUMO need not be asked for: the kind, and length, width, height [m]."""
+    """Constants of a vehicle: its kind, and length, width, height [m]."""
 
     kind: str
     size: tuple[float, float, float]
 
 
 class Traffic:
-    """A running traffic simulation. Same network, seed, settings and steps: same bytes.
+    """A running traffic simulation, determined by network, seed, settings and steps.
 
     Attributes:
-        network: the name of the stored network.
-        seed: a whole number >= 0.
-        settings: how much traffic there is.
-        roads: the network's geometry.
-        target: how many vehicles are kept on the network; fewer where roads do not take so many.
+        network: name of the stored network.
+        seed: integer >= 0.
+        settings: of the traffic.
+        roads: geometry of the network.
+        target: target number of vehicles on the network, limited by the length of its lanes.
 
     Raises:
-        ValueError: there is no such network; the message has the nearest one.
+        ValueError: unknown network; the message suggests the nearest one.
         ModuleNotFoundError: libsumo is not installed.
         RuntimeError: another `Traffic` is open in this process.
     """
@@ -184,10 +184,10 @@ class Traffic:
         drawn_speed, drawn_density = rng.uniform(*speed_range), rng.uniform(*density_range)
         lanes = [lane for lane in self.roads.lanes if not lane.internal]
         road = sum(lane.length for lane in lanes)
-        wanted = round(road * drawn_density / 100.0) if settings.vehicles is None else settings.vehicles
-        self.target = max(1, min(wanted, int(road / _SPACE_PER_VEHICLE)))
-        self._narrowest = min(lane.width for lane in lanes)
-        self._known: dict[str, _Vehicle] = {}
+        target = round(road * drawn_density / 100.0) if settings.vehicles is None else settings.vehicles
+        self.target = max(1, min(target, int(road / _SPACE_PER_VEHICLE)))
+        self._min_lane_width = min(lane.width for lane in lanes)
+        self._vehicles: dict[str, _Vehicle] = {}
         self._routes: dict[tuple[str, ...], str] = {}
         self._steps = self._recorded_from = 0
         self._sumo = _open_libsumo(self)
@@ -218,42 +218,42 @@ class Traffic:
         return (self._steps - self._recorded_from) * _STEP
 
     def step(self, seconds: float = _STEP) -> None:
-        """Go on by this time: a multiple of 0.1 s.
+        """Advance the simulation by a multiple of 0.1 s.
 
         Raises:
             ValueError: not a positive multiple of 0.1 s.
             RuntimeError: the simulation is closed.
         """
-        self._refuse_closed()
+        self._check_open()
         steps = round(seconds / _STEP) if math.isfinite(seconds) else 0
         if steps < 1 or abs(steps * _STEP - seconds) > 1e-6:
             raise ValueError(f"seconds must be a positive multiple of {_STEP}, got {seconds}")
         for _ in range(steps):
             if self._steps and self._steps % _STEPS_PER_DEMAND == 0:
-                self._replace_those_gone()
+                self._replace_departed()
             self._sumo.simulationStep()
             self._steps += 1
 
     def vehicles(self) -> TrafficSnapshot:
-        """All vehicles now.
+        """All vehicles at the current time.
 
         Raises:
             RuntimeError: the simulation is closed.
         """
-        self._refuse_closed()
+        self._check_open()
         vehicle = self._sumo.vehicle
         names = sorted(vehicle.getIDList(), key=int)
-        known = [self._known[name] for name in names]
+        constants = [self._vehicles[name] for name in names]
         front = np.array([vehicle.getPosition(name) for name in names], dtype=np.float64).reshape(-1, 2)
         # SUMO's angles are clockwise from north.
         yaw = wrap_angle(math.pi / 2 - np.radians([vehicle.getAngle(name) for name in names]))
-        size = np.array([one.size for one in known], dtype=np.float64).reshape(-1, 3)
-        # SUMO's positions are those of front bumpers.
+        size = np.array([one.size for one in constants], dtype=np.float64).reshape(-1, 3)
+        # SUMO's positions are at the front bumper.
         centre = front - size[:, :1] / 2 * np.column_stack([np.cos(yaw), np.sin(yaw)])
         return TrafficSnapshot(
             time=self.time,
             id=np.array(names, dtype=np.int64),
-            kind=np.array([one.kind for one in known], dtype=np.str_),
+            kind=np.array([one.kind for one in constants], dtype=np.str_),
             length=size[:, 0],
             width=size[:, 1],
             height=size[:, 2],
@@ -264,14 +264,14 @@ class Traffic:
         )
 
     def _start(self, speed_factor: float) -> None:
-        """Start SUMO, put vehicles all along the roads, and let them sort themselves out."""
+        """Start SUMO, insert vehicles all along the roads, and run the warm-up."""
         sumo, rng = self._sumo, self._rng
         with tempfile.TemporaryDirectory() as folder:
             types = Path(folder) / "types.add.xml"
             types.write_text(_vehicle_types())
             options = ["--net-file", str(network_file(self.network)), "--additional-files", str(types)]
             options += ["--seed", str(self.seed % 2**31), "--step-length", str(_STEP)]
-            options += ["--lateral-resolution", str(_LATERAL_RESOLUTION), "--max-depart-delay", str(_PATIENCE)]
+            options += ["--lateral-resolution", str(_LATERAL_RESOLUTION), "--max-depart-delay", str(_MAX_DEPART_DELAY)]
             options += ["--time-to-teleport", "-1", "--collision.action", "none"]
             options += ["--no-step-log", "--no-warnings", "--duration-log.disable"]
             sumo.start(["sumo", *options])
@@ -280,7 +280,7 @@ class Traffic:
         for name in sumo.trafficlight.getIDList():
             phases = len(sumo.trafficlight.getAllProgramLogics(name)[0].phases)
             sumo.trafficlight.setPhase(name, int(rng.integers(phases)))
-        rare = np.array([1.0 if self.roads.kind != "residential" else _IN_HOUSING.get(kind, 1.0) for kind in _KINDS])
+        rare = np.array([1.0 if self.roads.kind != "residential" else _RESIDENTIAL_FACTORS.get(kind, 1.0) for kind in _KINDS])
         shares = rare * [facts.share for facts in _KINDS.values()]
         self._kind_shares = shares / shares.sum()
         self._route_shares = self._draw_route_shares()
@@ -295,7 +295,7 @@ class Traffic:
         self._recorded_from = self._steps
 
     def _draw_route_shares(self) -> FloatArray:
-        """How often each of the network's routes is driven: some roads are busier than others."""
+        """Random probability of each route: some roads are busier than others."""
         roads = Counter(lane.edge for lane in self.roads.lanes)
         ends = sorted({edge for route in self.roads.routes for edge in (route[0], route[-1])})
         busy = {edge: self._rng.uniform(0.3, 1.0) * roads[edge] for edge in ends}
@@ -303,14 +303,14 @@ class Traffic:
         shares: FloatArray = weight / weight.sum()
         return shares
 
-    def _replace_those_gone(self) -> None:
-        """Add vehicles at the fringe until there are as many as there should be, those still waiting included."""
+    def _replace_departed(self) -> None:
+        """Add vehicles at the entries of the network up to the target, counting those still to be inserted."""
         vehicles = self._sumo.vehicle.getIDCount() + len(self._sumo.simulation.getPendingVehicles())
         for _ in range(self.target - vehicles):
             self._add_vehicle(anywhere=False)
 
     def _add_vehicle(self, anywhere: bool) -> None:
-        """Ask SUMO for one more vehicle, at the beginning of a trip or anywhere on one."""
+        """Request one more vehicle from SUMO, at the start of a route or anywhere on one."""
         sumo, rng = self._sumo, self._rng
         edges = self.roads.routes[int(rng.choice(len(self.roads.routes), p=self._route_shares))]
         if anywhere:
@@ -321,12 +321,12 @@ class Traffic:
             sumo.route.add(self._routes[edges], edges)
         kind = VEHICLE_KINDS[int(rng.choice(len(VEHICLE_KINDS), p=self._kind_shares))]
         facts = _KINDS[kind]
-        # Mostly one draw for how big it is as a whole: long vehicles tend to be wide and high.
+        # A common draw correlates the dimensions: long vehicles tend to be wide and high.
         shares = 0.7 * rng.uniform() + 0.3 * rng.uniform(size=3)
         size = [low + share * (high - low) for share, (low, high) in zip(shares, facts[1:4], strict=True)]
-        beside = min(self.settings.lateral_offset, max(0.0, (self._narrowest - size[1]) / 2 - _EDGE_MARGIN))
-        name = str(len(self._known))
-        self._known[name] = _Vehicle(kind, (float(size[0]), float(size[1]), float(size[2])))
+        beside = min(self.settings.lateral_offset, max(0.0, (self._min_lane_width - size[1]) / 2 - _EDGE_MARGIN))
+        name = str(len(self._vehicles))
+        self._vehicles[name] = _Vehicle(kind, (float(size[0]), float(size[1]), float(size[2])))
         sumo.vehicle.add(
             name,
             self._routes[edges],
@@ -341,17 +341,17 @@ class Traffic:
         sumo.vehicle.setMinGap(name, rng.uniform(1.2, 3.0))
         sumo.vehicle.setLateralAlignment(name, f"{rng.uniform(-beside, beside):.2f}")
 
-    def _refuse_closed(self) -> None:
+    def _check_open(self) -> None:
         if _open is None or _open() is not self:
             raise RuntimeError("this Traffic is closed")
 
 
 def _vehicle_types() -> str:
-    """The kinds as SUMO wants them."""
+    """SUMO's XML of the vehicle kinds."""
     lines = []
     for kind, facts in _KINDS.items():
-        # Sideways only while driving, and the slower the longer: a vehicle that stands across two lanes is in the way,
-        # and SUMO does not know that turned ones need more room.
+        # Lateral motion only while driving, and slower for long vehicles: one that stops across two lanes blocks both,
+        # and SUMO ignores the additional space of rotated vehicles.
         turn = 0.2 if facts.length[1] < 6.0 else 0.08
         lines.append(
             f'<vType id="{kind}" vClass="{facts.sumo_class}" accel="{facts.acceleration}" maxSpeed="{facts.top_speed}"'
@@ -364,7 +364,7 @@ _open: weakref.ref[Traffic] | None = None
 
 
 def _open_libsumo(owner: Traffic) -> Any:
-    """The libsumo module, from now on `owner`'s."""
+    """Import libsumo and register `owner` as the open simulation."""
     global _open
     try:
         import libsumo
@@ -372,7 +372,7 @@ def _open_libsumo(owner: Traffic) -> Any:
         raise ModuleNotFoundError("traffic needs SUMO: pip install cobevglue[simulation]") from None
     if libsumo.isLoaded():
         if _open is None or _open() is not None:
-            raise RuntimeError("SUMO runs one simulation a process: close() the other Traffic first")
-        libsumo.close()  # its owner was forgotten without having been closed
+            raise RuntimeError("SUMO supports one simulation per process: close() the other Traffic first")
+        libsumo.close()  # its owner was garbage-collected without close()
     _open = weakref.ref(owner)
     return libsumo

@@ -1,4 +1,4 @@
-"""Bodies of vehicles in side view and plan view, as shares of their length, height and width."""
+"""Side and plan views of vehicle bodies, relative to length, height and width."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from cobevglue.typing import BoolArray, FloatArray
 __all__ = ["BODIES", "Body", "varied"]
 
 _WINDOW = 0.12
-"""From this height of the roof above the shoulder on there are windows, in shares of the height."""
+"""Minimum height of windows: of the roof above the shoulder, relative to the vehicle's height."""
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A body in shares of the length, the height and the half width, at S stations from the rear to the front.
+    """A body, relative to length, height and half width, at S stations from the rear to the front.
 
     Attributes:
-        along: (S,) where the stations are, in shares of the length from the rear (0) to the front (1).
+        along: (S,) positions of the stations, from the rear (0) to the front (1).
         shoulder: (S,) height of the shoulder.
-        roof: (S,) height of the roof; that of the shoulder where there is no cabin.
+        roof: (S,) height of the roof; that of the shoulder outside the cabin.
         half_width: (S,) half width at the shoulder.
         clearance: height of the sill.
-        roof_width: half width of the roof beside that at the shoulder.
-        axles: where the wheels are, along.
-        wheel: radius beside the height.
-        mirror: how far mirrors stick out on either side [m].
+        roof_width: half width of the roof relative to that at the shoulder.
+        axles: positions of the axles.
+        wheel: wheel radius relative to the height.
+        mirror: protrusion of the mirrors on either side [m].
     """
 
     along: tuple[float, ...]
@@ -42,15 +42,15 @@ class Body:
 
     @property
     def profile(self) -> FloatArray:
-        """(4, S) along, shoulder, roof and half width as an array."""
+        """(4, S) along, shoulder, roof and half width."""
         return np.array([self.along, self.shoulder, self.roof, self.half_width])
 
     @property
     def windows(self) -> BoolArray:
-        """(S,) at which stations the roof is so far above the shoulder that there are windows."""
+        """(S,) whether each station has windows."""
         _, shoulder, roof, _ = self.profile
-        open_: BoolArray = roof - shoulder > _WINDOW
-        return open_
+        windows: BoolArray = roof - shoulder > _WINDOW
+        return windows
 
 
 BODIES: dict[str, tuple[Body, ...]] = {
@@ -61,7 +61,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
             roof=(0.50, 0.64, 0.70, 0.73, 0.95, 1.00, 0.97, 0.67, 0.60, 0.53, 0.40),
             half_width=(0.70, 0.86, 0.95, 0.99, 1.00, 1.00, 1.00, 1.00, 0.96, 0.88, 0.64),
         ),
-        Body(  # limousine: a long flat boot
+        Body(  # saloon: a long flat boot
             along=(0.00, 0.02, 0.10, 0.24, 0.34, 0.45, 0.55, 0.68, 0.86, 0.96, 1.00),
             shoulder=(0.55, 0.66, 0.69, 0.70, 0.68, 0.67, 0.67, 0.66, 0.63, 0.57, 0.42),
             roof=(0.55, 0.66, 0.69, 0.72, 0.96, 1.00, 0.97, 0.69, 0.63, 0.57, 0.42),
@@ -74,7 +74,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
             roof=(0.48, 0.64, 0.78, 0.93, 1.00, 0.97, 0.66, 0.57, 0.49, 0.38),
             half_width=(0.70, 0.87, 0.96, 1.00, 1.00, 1.00, 1.00, 0.95, 0.84, 0.62),
         ),
-        Body(  # estate: the roof goes on to the tail
+        Body(  # estate: the roof extends to the tail
             along=(0.00, 0.02, 0.05, 0.11, 0.35, 0.56, 0.72, 0.88, 0.96, 1.00),
             shoulder=(0.46, 0.62, 0.67, 0.69, 0.67, 0.66, 0.65, 0.60, 0.53, 0.40),
             roof=(0.46, 0.64, 0.84, 0.95, 1.00, 0.97, 0.67, 0.60, 0.53, 0.40),
@@ -109,7 +109,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
             half_width=(0.78, 0.90, 0.95, 0.98, 1.00, 1.00, 1.00, 0.96, 0.88, 0.70),
             axles=(0.16, 0.81),
         ),
-        Body(  # one box: the bonnet goes on in the windscreen, the roof falls to the tail
+        Body(  # one box: bonnet and windscreen in one line, the roof slopes to the tail
             along=(0.00, 0.02, 0.06, 0.20, 0.45, 0.60, 0.82, 0.94, 1.00),
             shoulder=(0.46, 0.58, 0.62, 0.62, 0.61, 0.61, 0.59, 0.50, 0.36),
             roof=(0.46, 0.66, 0.84, 0.95, 1.00, 0.96, 0.63, 0.50, 0.36),
@@ -127,7 +127,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
             roof_width=0.76,
             wheel=0.21,
         ),
-        Body(  # the roof falls to a raked tail
+        Body(  # the roof slopes to a raked tail
             along=(0.00, 0.02, 0.09, 0.22, 0.42, 0.55, 0.71, 0.91, 0.98, 1.00),
             shoulder=(0.46, 0.62, 0.67, 0.68, 0.67, 0.66, 0.65, 0.59, 0.48, 0.38),
             roof=(0.46, 0.64, 0.76, 0.94, 1.00, 0.97, 0.67, 0.59, 0.48, 0.38),
@@ -187,7 +187,7 @@ BODIES: dict[str, tuple[Body, ...]] = {
             roof_width=0.80,
             axles=(0.22, 0.83),
         ),
-        Body(  # a wedge: one edge across the roof, a cover that goes on to the tail
+        Body(  # a wedge: one edge across the roof, a cover that extends to the tail
             along=(0.00, 0.01, 0.30, 0.54, 0.82, 0.97, 1.00),
             shoulder=(0.58, 0.66, 0.65, 0.63, 0.58, 0.50, 0.38),
             roof=(0.58, 0.66, 0.83, 1.00, 0.64, 0.50, 0.38),
@@ -268,24 +268,24 @@ BODIES: dict[str, tuple[Body, ...]] = {
         ),
     ),
 }
-"""Side and plan views by kind of vehicle; where there are several, each is as likely."""
+"""Side and plan views by kind of vehicle; equally likely where several are given."""
 
 _SPREAD = 0.04
-"""Standard deviation, in shares, by which heights and widths differ within a kind."""
+"""Relative standard deviation of heights and widths within a kind."""
 _SHIFTS = (0.03, 0.02, 0.012)
-"""Standard deviation, in shares of the length, of the waves by which pillars are moved along it."""
+"""Standard deviations of the amplitudes of the sine waves that shift the stations, relative to the length."""
 
 
 def varied(body: Body, rng: np.random.Generator) -> Body:
-    """The same kind of body, a little different: pillars further ahead or behind, boot and bonnet higher or lower.
+    """A random variation of a body: positions of pillars, heights of boot and bonnet, widths.
 
     Args:
-        body: what all of its kind are like.
-        rng: for what differs; the same draws give the same body.
+        body: the nominal body.
+        rng: random generator.
     """
     along, shoulder, roof, half_width = body.profile
-    spread = rng.normal(scale=_SPREAD, size=5)  # one more than is used: without it all simulated cars would be others
-    shift = np.clip(rng.normal(size=len(_SHIFTS)), -1.7, 1.7) * _SHIFTS  # so bounded, their order stays
+    spread = rng.normal(scale=_SPREAD, size=5)  # the fifth is unused, but keeps the random stream and thus all simulated cars
+    shift = np.clip(rng.normal(size=len(_SHIFTS)), -1.7, 1.7) * _SHIFTS  # the bound preserves their order
     moved = along + np.sin(np.pi * np.outer(along, 1 + np.arange(len(shift)))) @ shift
     raised = 1.0 + spread[0] + spread[1] * (2.0 * along - 1.0)
     roof = np.where(body.windows, roof, roof * raised)

@@ -1,4 +1,4 @@
-"""Which boxes a sensor at the origin sees, in the plane: near enough, and not hidden behind others."""
+"""Visibility of boxes from a sensor at the origin in the bird's-eye view: range and occlusion."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _RAYS_PER_BOX = 9
 
 
 def is_visible(boxes: Boxes, max_range: float, min_fraction: float) -> BoolArray:
-    """(N,) whether a sensor at the origin sees each box: centre within `max_range` [m], enough of it not hidden."""
+    """(N,) whether each box's centre is within `max_range` [m] and its visible fraction is at least `min_fraction`."""
     distance = np.hypot(boxes.center[:, 0], boxes.center[:, 1])
     return (distance <= max_range) & (visible_fraction(boxes) >= min_fraction)
 
 
 def visible_fraction(boxes: Boxes) -> FloatArray:
-    """(N,) the part of each box's angular width that no other box covers, seen from the origin.
+    """(N,) fraction of each box's angular width from the origin that no other box occludes.
 
-    Footprints block the view whatever their height, so that this is a little stricter than a LiDAR on a roof.
+    Footprints occlude whatever their height, so this is slightly stricter than for a LiDAR on a roof.
     """
     n = len(boxes)
     if n == 0:
@@ -30,7 +30,7 @@ def visible_fraction(boxes: Boxes) -> FloatArray:
     corners = boxes.bev_corners()
     bearing = np.arctan2(boxes.center[:, 1], boxes.center[:, 0])
     offset = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - bearing[:, None])
-    share = (np.arange(_RAYS_PER_BOX) + 0.5) / _RAYS_PER_BOX  # the middle of each ray's part of the width
+    share = (np.arange(_RAYS_PER_BOX) + 0.5) / _RAYS_PER_BOX  # rays at the centres of equal parts of the width
     low, high = offset.min(axis=1)[:, None], offset.max(axis=1)[:, None]
     angle = bearing[:, None] + low + share * (high - low)
 
@@ -42,9 +42,9 @@ def visible_fraction(boxes: Boxes) -> FloatArray:
 
 
 def _distance_to(boxes: Boxes, direction: FloatArray) -> FloatArray:
-    """(..., N) how far along each ray (..., 2) from the origin each footprint begins [m]; infinite where it misses."""
+    """(..., N) distance [m] to each footprint along rays (..., 2) from the origin; infinite without intersection."""
     c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
-    # Origin and rays in each footprint's own axes, where it is an interval along each axis (the slab method).
+    # Slab method: origin and rays in the frame of each footprint, where it is an interval along each axis.
     origin = np.stack(
         [-c * boxes.center[:, 0] - s * boxes.center[:, 1], s * boxes.center[:, 0] - c * boxes.center[:, 1]]
     )
@@ -53,7 +53,7 @@ def _distance_to(boxes: Boxes, direction: FloatArray) -> FloatArray:
     enter, leave = np.full(ray[0].shape, -np.inf), np.full(ray[0].shape, np.inf)
     for axis in (0, 1):
         half = boxes.size[:, axis] / 2.0
-        # A ray along a slab never crosses its sides; the smallest step instead of zero sends them to +-infinity.
+        # A tiny step instead of zero moves the intersections of rays parallel to a slab to about +-infinity.
         step = np.where(np.abs(ray[axis]) < 1e-12, 1e-12, ray[axis])
         first, second = (-half - origin[axis]) / step, (half - origin[axis]) / step
         enter, leave = np.maximum(enter, np.minimum(first, second)), np.minimum(leave, np.maximum(first, second))

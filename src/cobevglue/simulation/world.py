@@ -1,4 +1,4 @@
-"""A simulated world: a road network with its surroundings, the traffic at one time, and what a LiDAR sees of it."""
+"""A simulated world: a road network with its surroundings, the traffic at one time, and LiDAR views of it."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ __all__ = ["LidarView", "World", "WorldAtTime"]
 
 _SCENERY_STREAM, _SHAPE_STREAM, _SCAN_STREAM = 20, 21, 22
 _FIRST_PARKED_ID = 100_000
-"""Parked vehicles have ids from here on, moving ones below."""
+"""First id of parked vehicles; moving ones have smaller ids."""
 _MARGIN = 7.0
-"""Vehicles whose centre is farther beyond the range of all sensors than this are left out of the scene [m]."""
+"""Vehicles are included in the scene up to this distance beyond the range of a sensor [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LidarView:
-    """What one sensor saw at one time, and the truth about it.
+    """Point cloud of one sensor at one time, with the ground truth.
 
     Attributes:
-        points: (N, 4) float32 x, y, z [m] and intensity in the sensor's frame; those on the agent's own body too.
-        own: (N,) whether a point lies on the agent's own body.
-        boxes: the K objects that at least one point lies on, in the sensor's frame, by id; labelled with their kind.
-        point_count: (K,) how many points lie on each.
+        points: (N, 4) float32 x, y, z [m] and intensity in the LiDAR frame, including points on the agent's own body.
+        own: (N,) whether a point is on the agent's own body.
+        boxes: the K objects with at least one point, in the LiDAR frame, with ids and kinds.
+        point_count: (K,) number of points on each object.
         world_SE3_lidar: (4, 4) pose of the sensor.
     """
 
@@ -46,16 +46,16 @@ class LidarView:
 
 
 class World:
-    """All that stands still. Same network and seed: same world.
+    """The static part of a world, determined by network and seed.
 
     Attributes:
-        roads: the network.
-        seed: a whole number >= 0.
-        scenery: ground, buildings and the like, and parked vehicles.
-        parked: the parked vehicles as boxes in the world frame, with ids from 100,000 on.
+        roads: the road network.
+        seed: integer >= 0.
+        scenery: ground, buildings, vegetation and parked vehicles.
+        parked: the parked vehicles as boxes in the world frame, with ids from 100,000.
 
     Raises:
-        ValueError: there is no such network; the message has the nearest one.
+        ValueError: unknown network; the message suggests the nearest one.
         ModuleNotFoundError: embreex or trimesh is not installed.
     """
 
@@ -64,7 +64,7 @@ class World:
         self.seed = seed
         self.scenery: Scenery = build_scenery(self.roads, np.random.default_rng([seed, _SCENERY_STREAM, 0]))
         parked = self.scenery.parked
-        self.parked = self._standing(
+        self.parked = self._boxes_on_ground(
             np.array([(car.x, car.y) for car in parked]).reshape(-1, 2),
             np.array([car.size for car in parked]).reshape(-1, 3),
             np.array([car.yaw for car in parked]),
@@ -72,23 +72,23 @@ class World:
             np.array([car.kind for car in parked], dtype=np.str_),
         )
         self._shapes: dict[int, Mesh] = {}
-        self._scene = _owned([(self.scenery.mesh, -1), *self._meshes(self.parked)])
+        self._scene = _ray_scene([(self.scenery.mesh, -1), *self._meshes(self.parked)])
 
     def at(self, traffic: TrafficSnapshot) -> WorldAtTime:
         """The world with this traffic on its roads."""
         xy = np.column_stack([traffic.x, traffic.y])
         size = np.column_stack([traffic.length, traffic.width, traffic.height])
-        return WorldAtTime(self, self._standing(xy, size, traffic.yaw, traffic.id, traffic.kind))
+        return WorldAtTime(self, self._boxes_on_ground(xy, size, traffic.yaw, traffic.id, traffic.kind))
 
-    def _standing(
+    def _boxes_on_ground(
         self, xy: FloatArray, size: FloatArray, yaw: FloatArray, ids: IntArray, kinds: Sequence[str] | np.ndarray
     ) -> Boxes:
-        """Boxes that stand on the ground."""
+        """Boxes on the ground."""
         z = self.scenery.ground.height(xy) + size[:, 2] / 2
         return Boxes(center=np.column_stack([xy, z]), size=size, yaw=yaw, track_id=ids, label=kinds)
 
     def _meshes(self, vehicles: Boxes) -> list[tuple[Mesh, int]]:
-        """The shape of each vehicle where it stands, with its id."""
+        """The mesh of each vehicle in the world frame, with its id."""
         assert vehicles.track_id is not None
         assert vehicles.label is not None
         placed = []
@@ -103,10 +103,10 @@ class World:
 
 
 class WorldAtTime:
-    """One instant of a world.
+    """A world at one time.
 
     Attributes:
-        world: what stands still.
+        world: the static world.
         moving: the traffic as boxes in the world frame.
         vehicles: all vehicles, moving and parked, in the world frame.
     """
@@ -117,17 +117,17 @@ class WorldAtTime:
         self.vehicles = Boxes.concatenate([moving, world.parked])
 
     def sensor_on_vehicle(self, vehicle: int, settings: LidarSettings, rng: np.random.Generator) -> FloatArray:
-        """(4, 4) pose of a sensor 0.5 m behind the middle of a moving vehicle, as OPV2V has it: on rods above its roof.
+        """(4, 4) pose of a sensor above the roof, 0.5 m behind the centre of a moving vehicle, as in OPV2V.
 
-        It leans with the ground, and by a few tenths of a degree at random.
+        It is tilted by the slope of the ground and by a few tenths of a degree at random.
 
         Raises:
-            ValueError: there is no such vehicle.
+            ValueError: no such vehicle.
         """
         assert self.moving.track_id is not None
         rows = np.flatnonzero(self.moving.track_id == vehicle)
         if not len(rows):
-            raise ValueError(f"there is no moving vehicle {vehicle}")
+            raise ValueError(f"no moving vehicle {vehicle}")
         row = int(rows[0])
         yaw = float(self.moving.yaw[row])
         x, y = self.moving.center[row, :2] - 0.5 * np.array([np.cos(yaw), np.sin(yaw)])
@@ -144,19 +144,19 @@ class WorldAtTime:
         settings: Sequence[LidarSettings],
         index: int = 0,
     ) -> list[LidarView]:
-        """What several sensors see at this instant.
+        """Simulate several sensors at this time.
 
         Args:
-            sensors: pose (4, 4) and the id of the vehicle that carries it (-1 for a mast), of each sensor.
-            settings: of each sensor.
-            index: of the frame, for the noise.
+            sensors: pose (4, 4) and vehicle id (-1 for a mast) of each sensor.
+            settings: settings of each sensor.
+            index: index of the frame, which seeds the noise.
         """
         if not sensors:
             return []
         places = np.array([pose[:2, 3] for pose, _ in sensors])
         reach = np.array([lidar.range + _MARGIN for lidar in settings])
         near = (np.hypot(*(self.moving.center[:, None, :2] - places[None]).transpose(2, 0, 1)) < reach).any(axis=1)
-        scene = _owned(self.world._meshes(self.moving[near]))
+        scene = _ray_scene(self.world._meshes(self.moving[near]))
         return [
             self._view(scene, pose, carrier, lidar, np.random.default_rng([self.world.seed, _SCAN_STREAM + i, index]))
             for i, ((pose, carrier), lidar) in enumerate(zip(sensors, settings, strict=True))
@@ -169,12 +169,12 @@ class WorldAtTime:
         ids = self.vehicles.track_id
         assert ids is not None
         hit, count = np.unique(cloud.owner, return_counts=True)
-        found = dict(zip(hit.tolist(), count.tolist(), strict=True))
-        counts = np.array([found.get(vehicle, 0) for vehicle in ids.tolist()], dtype=np.int64)
-        seen = (counts > 0) & (ids != carrier)
-        boxes = transform_boxes(self.vehicles[seen], inverse_SE3(pose))
+        by_id = dict(zip(hit.tolist(), count.tolist(), strict=True))
+        counts = np.array([by_id.get(vehicle, 0) for vehicle in ids.tolist()], dtype=np.int64)
+        observed = (counts > 0) & (ids != carrier)
+        boxes = transform_boxes(self.vehicles[observed], inverse_SE3(pose))
         own = (cloud.owner == carrier) & (carrier >= 0)
-        return LidarView(cloud.points, own, boxes, counts[seen], pose)
+        return LidarView(cloud.points, own, boxes, counts[observed], pose)
 
     def _sensor(self, x: float, y: float, yaw: float, height: float, lean: FloatArray) -> FloatArray:
         ground = self.world.scenery.ground
@@ -191,6 +191,6 @@ class WorldAtTime:
         return pose
 
 
-def _owned(meshes: Sequence[tuple[Mesh, int]]) -> RayScene:
+def _ray_scene(meshes: Sequence[tuple[Mesh, int]]) -> RayScene:
     owner = [np.full(len(mesh), vehicle, dtype=np.int64) for mesh, vehicle in meshes]
     return RayScene(Mesh.concatenate([mesh for mesh, _ in meshes]), np.concatenate([np.zeros(0, np.int64), *owner]))
