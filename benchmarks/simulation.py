@@ -51,14 +51,14 @@ def drive(number: int, frames: int, seed: int) -> Taken:
         with timed(taken, "scene of moving vehicles"):
             return build(meshes)
 
-    build = world._owned
+    build = world._ray_scene
     scenario = simulated_scenario("test", number, seed, ScenarioSettings(frames=frames, agents=AGENTS))
     with timed(taken, "all"):
         with timed(taken, "traffic"):
             carriers = scenario.carriers
         with timed(taken, "world"):
             scenario.world  # noqa: B018
-        with mock.patch.object(world, "scan", scan), mock.patch.object(world, "_owned", owned):
+        with mock.patch.object(world, "scan", scan), mock.patch.object(world, "_ray_scene", owned):
             clouds = sum(len(scenario.views(index)) for index in range(frames))
     assert clouds <= frames * len(carriers)
     taken["other"] = taken["all"] - sum(taken[stage] for stage in STAGES)

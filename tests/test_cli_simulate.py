@@ -188,7 +188,7 @@ def test_other_peoples_folders_are_left_alone(
     (tmp_path / there).parent.mkdir(parents=True)
     (tmp_path / there).write_text("")
     assert simulate(tmp_path, "--format", kind) == 2
-    assert "not made by this command" in capsys.readouterr().err
+    assert "not written by this command" in capsys.readouterr().err
 
 
 def test_a_missing_extra_is_said_with_its_remedy(

@@ -1,4 +1,4 @@
-"""Simulated drives: the same from the same seed, and what several agents see of one world fits together."""
+"""Simulated scenarios: deterministic for a seed, with consistent views of several agents."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SETTINGS = ScenarioSettings(frames=3, agents=2, roadside_units=1, traffic=Traffi
 
 
 @pytest.fixture(scope="module")
-def drive() -> SimulatedScenario:
+def scenario() -> SimulatedScenario:
     """Two cars and a roadside unit, three frames."""
     return SimulatedScenario(NETWORK, 4, SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def views(drive: SimulatedScenario) -> list[dict[str, LidarView]]:
-    return [drive.views(index) for index in range(len(drive))]
+def views(scenario: SimulatedScenario) -> list[dict[str, LidarView]]:
+    return [scenario.views(index) for index in range(len(scenario))]
 
 
 def ids(boxes: Boxes) -> IntArray:
@@ -55,19 +55,19 @@ def content(views: dict[str, LidarView]) -> list[bytes]:
     ]
 
 
-def test_seed_decides_frames_in_any_order(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
-    again = pickle.loads(pickle.dumps(drive))  # as another process has it, with nothing computed
+def test_seed_decides_frames_in_any_order(scenario: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
+    again = pickle.loads(pickle.dumps(scenario))  # as another process has it, with nothing computed
     assert "traffic" not in vars(again)
     assert content(again.views(2)) == content(views[2])
     assert content(again.views(-1)) == content(views[2])
     assert content(views[1]) != content(views[2])
 
 
-def test_agents_are_present_and_near_each_other(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
+def test_agents_are_present_and_near_each_other(scenario: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
     assert [list(seen) for seen in views] == [["car1", "car2", "-1"]] * 3
     places = [views[1][agent].world_SE3_lidar[:2, 3] for agent in ("car1", "car2")]
     assert 4.0 < np.hypot(*(places[0] - places[1])) < SETTINGS.max_distance
-    first, second, unit = drive.carriers.values()
+    first, second, unit = scenario.carriers.values()
     assert str(first) < str(second), "files named by id are in the order of the names"
     assert unit == -1
 
@@ -103,50 +103,56 @@ def points_inside(view: LidarView, margin: float) -> IntArray:
     return np.array(counts)
 
 
-def test_an_agent_never_lists_itself_but_others_do(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
-    for agent, carrier in drive.carriers.items():
+def test_an_agent_never_lists_itself_but_others_do(
+    scenario: SimulatedScenario, views: list[dict[str, LidarView]]
+) -> None:
+    for agent, carrier in scenario.carriers.items():
         assert carrier not in ids(views[0][agent].boxes)
     near = np.hypot(*views[0]["car1"].points[views[0]["car1"].own][:, :2].T)
     assert len(near) == 0 or near.max() < 4.0, "its own body is all around the sensor"
     assert not views[0]["-1"].own.any()
 
 
-def test_frames_are_those_of_any_data_set(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
-    frame = drive[1]
-    assert (frame.scenario, frame.timestamp) == (drive.name, "000002")
+def test_frames_are_those_of_any_data_set(scenario: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
+    frame = scenario[1]
+    assert (frame.scenario, frame.timestamp) == (scenario.name, "000002")
     assert frame.time == pytest.approx(0.1)
     assert [agent.is_infrastructure for agent in frame.agents.values()] == [False, False, True]
     np.testing.assert_array_equal(frame.agents["car2"].points, views[1]["car2"].points)
     truth = frame.ground_truth("car1")
     everything = set().union(*(ids(view.boxes).tolist() for view in views[1].values()))
-    assert set(ids(truth).tolist()) == everything - {drive.carriers["car1"]}
+    assert set(ids(truth).tolist()) == everything - {scenario.carriers["car1"]}
     assert truth.label is not None
 
 
-def test_roadside_unit_is_off_road_seeing_junction(drive: SimulatedScenario, views: list[dict[str, LidarView]]) -> None:
+def test_roadside_unit_is_off_road_seeing_junction(
+    scenario: SimulatedScenario, views: list[dict[str, LidarView]]
+) -> None:
     poses = [seen["-1"].world_SE3_lidar for seen in views]
     np.testing.assert_array_equal(poses[0], poses[2])  # it does not move
     place = poses[0][:3, 3]
-    roads = drive.world.roads
+    roads = scenario.world.roads
     assert roads.distance_to_road(place[None, :2])[0] > 1.0
-    assert place[2] - drive.world.scenery.ground.height([place[:2]])[0] == pytest.approx(5.0)
+    assert place[2] - scenario.world.scenery.ground.height([place[:2]])[0] == pytest.approx(5.0)
     ahead = place[:2] + np.outer([10.0, 15.0, 20.0], poses[0][:2, 0])
     assert (roads.distance_to_road(ahead) == 0.0).any(), "it looks at the road"
     assert len(views[0]["-1"].boxes) >= 5
 
 
 def test_many_roadside_units_stand_apart() -> None:
-    drive = SimulatedScenario(NETWORK, 4, SETTINGS.model_copy(update={"frames": 1, "agents": 1, "roadside_units": 3}))
-    places = np.array([pose[:2, 3] for pose in drive._masts.values()])
+    scenario = SimulatedScenario(
+        NETWORK, 4, SETTINGS.model_copy(update={"frames": 1, "agents": 1, "roadside_units": 3})
+    )
+    places = np.array([pose[:2, 3] for pose in scenario._masts.values()])
     apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))[np.triu_indices(3, 1)]
     assert apart.min() > 12.0
 
 
 def test_scenarios_cycle_networks_of_their_split() -> None:
     drives = list(simulated_scenarios("test", 12, seed=3))
-    networks = [drive.network for drive in drives]
+    networks = [scenario.network for scenario in drives]
     assert set(networks) == set(NETWORKS["test"])
-    assert len({drive.seed for drive in drives}) == len({drive.name for drive in drives}) == 12
+    assert len({scenario.seed for scenario in drives}) == len({scenario.name for scenario in drives}) == 12
     assert simulated_scenario("train", 0, 3).seed != drives[0].seed
     assert simulated_scenario("test", 7, 3).seed == drives[7].seed, "one by one the same as in a row"
 
@@ -208,6 +214,6 @@ def test_too_few_vehicles_are_said_so() -> None:
 
 
 def test_departed_agent_is_not_in_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = SimulatedScenario(NETWORK, 4, ScenarioSettings(frames=3, agents=2))
-    monkeypatch.setitem(vars(drive), "traffic", tuple(traffic([(1, 0.0, "suv", 3), (2, 9.0, "suv", 2)])))
-    assert [list(frame.agents) for frame in drive] == [["car1", "car2"], ["car1", "car2"], ["car1"]]
+    scenario = SimulatedScenario(NETWORK, 4, ScenarioSettings(frames=3, agents=2))
+    monkeypatch.setitem(vars(scenario), "traffic", tuple(traffic([(1, 0.0, "suv", 3), (2, 9.0, "suv", 2)])))
+    assert [list(frame.agents) for frame in scenario] == [["car1", "car2"], ["car1", "car2"], ["car1"]]

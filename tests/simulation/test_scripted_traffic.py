@@ -100,6 +100,6 @@ def test_boxes_stand_on_the_ground_below_the_lidar() -> None:
 
 
 def test_full_junction_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cobevglue.simulation.scripted_traffic._TRIES", 20)
+    monkeypatch.setattr("cobevglue.simulation.scripted_traffic._MAX_FAILURES", 20)
     with pytest.raises(ValueError, match="the junction has room for"):
         place_traffic(300, 2, 1.0, np.random.default_rng([0, 0, 0]))

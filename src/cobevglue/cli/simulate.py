@@ -98,7 +98,7 @@ def simulate(
         "root": str(out),
         "format": kind.value,
         "split": name,
-        "scenarios": [{"name": task.scenario.name, "folder": str(layout.place(task))} for task in tasks],
+        "scenarios": [{"name": task.scenario.name, "folder": str(layout.scenario_folder(task))} for task in tasks],
         "agents": settings.agents,
         "roadside_units": settings.roadside_units,
         "frames_written": report.frames_written,

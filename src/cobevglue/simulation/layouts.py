@@ -175,7 +175,7 @@ class _TreeLayout(Layout):
 
 
 class OPV2VLayout(_TreeLayout):
-    """OPV2V, or V2XSet with roadside units: agents are named by vehicle ids, roadside units -1, -2, …"""
+    """OPV2V, or V2XSet with roadside units: agents are named by vehicle ids, roadside units by -1, -2 and so on."""
 
     number_step: ClassVar[int] = 2
 

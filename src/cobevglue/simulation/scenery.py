@@ -232,7 +232,8 @@ class _Builder:
                     py = float(y + along * np.sin(angle) + across * np.cos(angle))
                     if rng.random() < fill and self._off_road(np.array([[px, py]]), 3.5):
                         blocked = any(
-                            radius > 3.5 and np.hypot(tx - px, ty - py) < radius + 2.0 for tx, ty, radius in self.occupied
+                            radius > 3.5 and np.hypot(tx - px, ty - py) < radius + 2.0
+                            for tx, ty, radius in self.occupied
                         )
                         near = any(np.hypot(car.x - px, car.y - py) < (2.5 if slant else 6.0) for car in self.parked)
                         if not blocked and not near:

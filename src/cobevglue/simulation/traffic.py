@@ -280,7 +280,9 @@ class Traffic:
         for name in sumo.trafficlight.getIDList():
             phases = len(sumo.trafficlight.getAllProgramLogics(name)[0].phases)
             sumo.trafficlight.setPhase(name, int(rng.integers(phases)))
-        rare = np.array([1.0 if self.roads.kind != "residential" else _RESIDENTIAL_FACTORS.get(kind, 1.0) for kind in _KINDS])
+        rare = np.array(
+            [1.0 if self.roads.kind != "residential" else _RESIDENTIAL_FACTORS.get(kind, 1.0) for kind in _KINDS]
+        )
         shares = rare * [facts.share for facts in _KINDS.values()]
         self._kind_shares = shares / shares.sum()
         self._route_shares = self._draw_route_shares()

@@ -284,7 +284,7 @@ def varied(body: Body, rng: np.random.Generator) -> Body:
         rng: random generator.
     """
     along, shoulder, roof, half_width = body.profile
-    spread = rng.normal(scale=_SPREAD, size=5)  # the fifth is unused, but keeps the random stream and thus all simulated cars
+    spread = rng.normal(scale=_SPREAD, size=5)  # the fifth is unused: it keeps the random stream as it was
     shift = np.clip(rng.normal(size=len(_SHIFTS)), -1.7, 1.7) * _SHIFTS  # the bound preserves their order
     moved = along + np.sin(np.pi * np.outer(along, 1 + np.arange(len(shift)))) @ shift
     raised = 1.0 + spread[0] + spread[1] * (2.0 * along - 1.0)
