@@ -151,7 +151,8 @@ def _label_folders(root: Path, labels: str) -> tuple[Path, Path]:
     if labels == "complemented" and not all(renamed):
         raise FileNotFoundError(
             f"DAIRV2X: no {backup[1]}, so {plain[1]} are the original labels; complemented labels are installed "
-            "there after renaming these to *_backup (or pass labels='original', as --dataset-option labels=original to a command)"
+            "there after renaming these to *_backup (or pass labels='original', as --dataset-option labels=original to "
+            "a command)"
         )
     return (backup[0], backup[1]) if labels == "original" and all(renamed) else plain
 
