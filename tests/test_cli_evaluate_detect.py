@@ -105,7 +105,7 @@ def test_clouds_without_labels_are_counted(weights: str, tmp_path: Path, capsys:
     printed = capsys.readouterr()
     report = json.loads(printed.out)
     assert [report[key] for key in ("frames", "without_cloud", "without_labels")] == [1, 2, 1]
-    assert "label/lidar/000001.json is not there; others like it are counted" in printed.err
+    assert "label/lidar/000001.json does not exist; others like it are counted" in printed.err
     (tmp_path / "vehicle-side/label/lidar/000002.json").unlink()
     assert evaluate(*words, "--weights", weights) == 2
     assert "none of the 2 clouds has labels: " in capsys.readouterr().err

@@ -186,7 +186,7 @@ def test_both_sets_of_labels_can_be_had(root: Path) -> None:
 
 def test_missing_complemented_labels_raise(root: Path) -> None:
     shutil.rmtree(root / "vehicle-side/label/lidar_backup")
-    with pytest.raises(FileNotFoundError, match=r"label_world_backup is there but .*lidar_backup is not"):
+    with pytest.raises(FileNotFoundError, match=r"label_world_backup exists but .*lidar_backup does not"):
         DAIRV2X(root, "val")
     shutil.rmtree(root / "cooperative/label_world_backup")
     with pytest.raises(FileNotFoundError, match=r"original labels.*labels='original'"):
@@ -357,7 +357,7 @@ def test_broken_or_missing_files_are_named(root: Path) -> None:
     with pytest.raises(ValueError, match=r"015438\.json: not readable as JSON"):
         frame.ground_truth("vehicle")
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"label_world/015438\.json is not there"):
+    with pytest.raises(FileNotFoundError, match=r"label_world/015438\.json does not exist"):
         frame.ground_truth("vehicle")
 
 

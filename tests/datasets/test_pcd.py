@@ -121,7 +121,7 @@ def test_truncated_file_is_named(tmp_path: Path, encoding: Encoding, kept: float
 def test_a_point_missing_at_the_end_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "a.pcd"
     path.write_bytes(good_bytes(path, Encoding.BINARY)[:-16])
-    with pytest.raises(ValueError, match="promises 3 points, the file has 2"):
+    with pytest.raises(ValueError, match="states 3 points, the file has 2"):
         read_pcd(path)
 
 
@@ -197,7 +197,7 @@ def test_intensities_of_bin_files(tmp_path: Path, stored: list[float], intensity
     np.testing.assert_allclose(points[:, 3], intensity, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("content", "message"), [(b"", "is empty"), (b"0" * 20, "20 bytes are no whole number")])
+@pytest.mark.parametrize(("content", "message"), [(b"", "is empty"), (b"0" * 20, "20 bytes are not a multiple of 16")])
 def test_cut_bin_files_are_named(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(ValueError, match=rf"a\.bin: {message}"):

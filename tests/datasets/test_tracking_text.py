@@ -147,7 +147,7 @@ def test_repeated_track_in_frame_names_both_lines(tmp_path: Path, reader: Reader
 
 
 def test_missing_and_binary_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"a\.txt is not there"):
+    with pytest.raises(FileNotFoundError, match=r"a\.txt does not exist"):
         read_kitti_labels(tmp_path / "a.txt")
     (tmp_path / "b.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(ValueError, match=r"b\.txt: not a text file"):

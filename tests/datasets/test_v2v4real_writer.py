@@ -79,7 +79,7 @@ def test_labels_without_a_cloud(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("agent", "number", "matrix", "objects", "said"),
     [
-        ("2", "000000", np.eye(4), OBJECTS, "called 0 and 1"),
+        ("2", "000000", np.eye(4), OBJECTS, "named 0 and 1"),
         ("0", "first", np.eye(4), OBJECTS, "digits"),
         ("0", "000000", 2 * np.eye(4), OBJECTS, "world_SE3_lidar"),
         ("0", "000000", np.eye(4), OBJECTS.replace(track_id=None), "track_id"),

@@ -23,7 +23,7 @@ from cobevglue.evaluation.alignment import (
     off_by_3,
     summarise,
 )
-from cobevglue.evaluation.alignment_data import noisy_label_sequences, smooth_drive, v2v4real_sequences
+from cobevglue.evaluation.alignment_data import noisy_label_sequences, smooth_trajectory, v2v4real_sequences
 
 DATA = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"COBEVGLUE_DATA: no folder {DATA}")
@@ -119,10 +119,10 @@ def test_evaluate_compares_with_the_truth_frame_by_frame() -> None:
     assert (first.true_matches, first.found_matches, first.possible_matches) == (1, 2, 2)
 
 
-def test_a_drive_is_smooth_and_repeatable() -> None:
-    drive = smooth_drive(3, 200)
-    assert drive == smooth_drive(3, 200) != smooth_drive(4, 200)
-    steps = [a.inverse() @ b for a, b in itertools.pairwise(drive)]
+def test_a_trajectory_is_smooth_and_repeatable() -> None:
+    trajectory = smooth_trajectory(3, 200)
+    assert trajectory == smooth_trajectory(3, 200) != smooth_trajectory(4, 200)
+    steps = [a.inverse() @ b for a, b in itertools.pairwise(trajectory)]
     assert max(math.hypot(s.x, s.y) for s in steps) < 1.6  # m in 0.1 s
     assert max(abs(s.yaw) for s in steps) < 0.02  # rad in 0.1 s
 

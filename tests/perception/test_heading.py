@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cobevglue.boxes import Boxes
 from cobevglue.perception import Perception, PointPillars
-from cobevglue.perception.decode import Found
+from cobevglue.perception.decode import Detections
 from cobevglue.perception.heading import HeadingInputs, HeadingRefiner, heading_inputs, refine_headings
 from cobevglue.se2 import SE2, wrap_angle
 from cobevglue.typing import Float32Array
@@ -20,11 +20,11 @@ from cobevglue.typing import Float32Array
 from .conftest import OBJECTS, cloud_of
 
 
-def found(*vehicles: tuple[float, ...], heading_confidence: float = 0.5) -> Found:
+def found(*vehicles: tuple[float, ...], heading_confidence: float = 0.5) -> Detections:
     """Vehicles x, y, z, l, w, h, yaw."""
     rows = np.array(vehicles, dtype=np.float64).reshape(-1, 7)
     boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], np.full(len(rows), 0.8), label=np.full(len(rows), "vehicle"))
-    return Found(boxes, np.full((len(rows), 3), 0.1), np.full(len(rows), heading_confidence))
+    return Detections(boxes, np.full((len(rows), 3), 0.1), np.full(len(rows), heading_confidence))
 
 
 def random_net(seed: int = 0) -> HeadingRefiner:
@@ -94,7 +94,7 @@ def test_of_many_others_the_nearest_are_seen() -> None:
     assert not heading_inputs(np.zeros((0, 4), np.float32), found(CAR)).around.any()
 
 
-def clouds_and_vehicles() -> st.SearchStrategy[tuple[Float32Array, Found]]:
+def clouds_and_vehicles() -> st.SearchStrategy[tuple[Float32Array, Detections]]:
     """A cloud of a few points about some vehicles, which may have none."""
     number = st.floats(-30.0, 30.0, width=32)
     vehicle = st.tuples(
@@ -113,7 +113,7 @@ def _around(vehicles: list[tuple[float, ...]], seed: int, count: int) -> Float32
 
 
 @given(clouds_and_vehicles(), st.integers(0, 5))
-def test_reversed_box_gets_negated_logit(case: tuple[Float32Array, Found], seed: int) -> None:
+def test_reversed_box_gets_negated_logit(case: tuple[Float32Array, Detections], seed: int) -> None:
     """So the vehicle faces the same way after all, whatever the box said and whatever was learnt."""
     cloud, vehicles = case
     net = random_net(seed)
@@ -130,7 +130,7 @@ def test_reversed_box_gets_negated_logit(case: tuple[Float32Array, Found], seed:
 
 
 @given(clouds_and_vehicles(), st.floats(-math.pi, math.pi))
-def test_sensor_orientation_does_not_matter(case: tuple[Float32Array, Found], angle: float) -> None:
+def test_sensor_orientation_does_not_matter(case: tuple[Float32Array, Detections], angle: float) -> None:
     """A mast has no lane of its own."""
     cloud, vehicles = case
     pose = SE2(0.0, 0.0, angle)
@@ -145,14 +145,14 @@ def test_sensor_orientation_does_not_matter(case: tuple[Float32Array, Found], an
         np.testing.assert_allclose(net(again).numpy(), net(looks).numpy(), atol=2e-2, rtol=1e-3)
 
 
-def _far_from_ties(vehicles: Found) -> bool:
+def _far_from_ties(vehicles: Detections) -> bool:
     """No two others are equally far from a vehicle, so that which come first is no matter of rounding."""
     gap = np.hypot(*(vehicles.boxes.center[:, None, :2] - vehicles.boxes.center[None, :, :2]).T)
     return all(np.diff(np.sort(row)).min(initial=1.0) > 1e-3 for row in gap)
 
 
 @given(clouds_and_vehicles())
-def test_boxes_with_negative_logit_are_reversed_only(case: tuple[Float32Array, Found]) -> None:
+def test_boxes_with_negative_logit_are_reversed_only(case: tuple[Float32Array, Detections]) -> None:
     cloud, vehicles = case
     net = random_net()
     with torch.inference_mode():

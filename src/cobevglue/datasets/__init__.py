@@ -1,11 +1,11 @@
-"""Data sets of collaborative perception, all giving the same `Frame`; and text files of tracking.
+"""Data sets of collaborative perception with a common `Frame` interface, and text files of tracking.
 
     for frame in OPV2V(root, split="test_culvercity")["TwoCars_1"]:
         frame.agents["car1"].points           # (N, 4) x, y, z, intensity, the agent's LiDAR frame
         frame.agents["car1"].world_SE3_lidar  # (4, 4)
         frame.agents["car1"].objects          # Boxes, the agent's LiDAR frame
 
-Everything is right-handed (x forward, y left, z up) whatever the files are, and read when it is used.
+All coordinates are right-handed (x forward, y left, z up), also where the files are not. Files are read lazily.
 """
 
 import inspect
@@ -29,7 +29,7 @@ from cobevglue.datasets.v2v4real import V2V4Real
 from cobevglue.datasets.v2v4real_writer import write_v2v4real_frame
 
 DATASETS: dict[str, type[Dataset]] = {"opv2v": OPV2V, "v2xset": V2XSet, "v2v4real": V2V4Real, "dair-v2x": DAIRV2X}
-"""Data sets by the name that users type; each is made from (root, split)."""
+"""Data set classes by command-line name; all take (root, split)."""
 
 __all__ = [
     "DAIRV2X",
@@ -54,17 +54,17 @@ __all__ = [
 
 
 def open_dataset(name: str, root: str | Path, split: str, options: Mapping[str, Any] | None = None) -> Dataset:
-    """A split of the data set of this name.
+    """Open a split of a data set by name.
 
     Args:
         name: a name in `DATASETS`.
-        root: its folder.
+        root: folder of the data set.
         split: name of the split.
         options: further arguments of its class: `labels` of DAIR-V2X, `left_handed` of V2V4Real.
 
     Raises:
-        ValueError: no such data set, option or split; names the nearest.
-        FileNotFoundError: it is not there; says what was looked for.
+        ValueError: unknown data set, option or split; the message suggests the most similar one.
+        FileNotFoundError: the data are missing; the message names the expected path.
     """
     if name not in DATASETS:
         raise ValueError(f"no data set {did_you_mean(name, DATASETS)}")

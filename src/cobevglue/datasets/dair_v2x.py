@@ -1,13 +1,13 @@
-"""DAIR-V2X-C: a real car and a roadside unit at 28 crossings; right-handed, so nothing is mirrored.
+"""DAIR-V2X-C: a real car and a roadside unit at 28 intersections; right-handed, so nothing is mirrored.
 
-Traps that are handled here:
+Properties of the data that are handled here:
 
-- The roadside unit's calibration errs; each pair has a `system_error_offset` to be added to its translation (or "").
+- The roadside unit's calibration has errors; each pair has a `system_error_offset` to add to its translation (or "").
 - There are two sets of labels. The complemented ones (Lu et al.) cover 360 degrees and are installed over the original
   ones, which are first renamed to `label_world_backup` and `lidar_backup`.
-- Cooperative labels are in the world; of them only the eight corners can be trusted, says the data set's own manual.
-- Numbers may be strings, boxes may have no size (left out), and clouds may be missing (`points` is None).
-- There are no object ids, so `track_id` is None: this set has no tracking truth, and no matching truth by id.
+- Cooperative labels are in the world frame; according to the manual, only their eight corners are reliable.
+- Numbers may be strings, boxes may have no size (omitted), and clouds may be missing (`points` is None).
+- There are no object ids, so `track_id` is None: no ground truth for tracking or matching.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from cobevglue.typing import Float32Array, FloatArray
 __all__ = ["DAIRV2X"]
 
 VEHICLES = ("car", "van", "truck", "bus")
-"""The classes that the benchmark counts, all as "car"."""
+"""The classes that the benchmark evaluates, all as "car"."""
 
 
 class DAIRV2X(Dataset):
     """DAIR-V2X-C: `DAIRV2X(root, split="val")[batch]` is a sequence of frames of "vehicle" and "infrastructure".
 
-    A scenario is a batch, one uncut recording of the car, and a frame a pair of clouds some ten milliseconds apart;
-    `Frame.time` is that of the car's cloud. A frame is named by the id of the car's files.
+    A scenario is a batch, one continuous recording of the car. A frame is a pair of clouds some ten milliseconds apart;
+    `Frame.time` is that of the car's cloud, and its name is the id of the car's files.
     """
 
     validation_split: ClassVar[str] = "val"
@@ -53,17 +53,18 @@ class DAIRV2X(Dataset):
         """Read the index files.
 
         Args:
-            root: the folder `cooperative-vehicle-infrastructure`, or the one that holds it.
+            root: the folder `cooperative-vehicle-infrastructure`, or its parent.
             split: name of the split.
             labels: "complemented" for the labels of Lu et al., "original" for those of the first release.
-            classes: types of objects to keep, in any case.
-            split_file: JSON list of the car's frame ids, or the official `cooperative-split-data.json`. Left out:
-                `<split>.json` or that name, in `root` or next to it. Ids without a pair are passed over (the official
-                test part is not published).
+            classes: types of objects to keep, case-insensitive.
+            split_file: JSON list of the car's frame ids, or the official `cooperative-split-data.json`. By default,
+                `<split>.json` or that name, in `root` or its parent. Ids without a pair are skipped (the official
+                test split is not published).
 
         Raises:
-            FileNotFoundError: something is not there; says what was looked for.
-            ValueError: no such split or labels, `classes` is a text, or a file is broken; names it and the field.
+            FileNotFoundError: a file or folder is missing; the message names the expected path.
+            ValueError: unknown split or labels, `classes` is a string, or a malformed file; the message names it and
+                the field.
         """
         if isinstance(classes, str) or not isinstance(classes, Collection):
             raise ValueError(f"DAIRV2X: classes must be a list of types, like [car, bus], got {classes!r}")
@@ -95,7 +96,7 @@ class DAIRV2X(Dataset):
 
     @property
     def cloud_location(self) -> str:
-        """Where the files of the clouds are expected, for error messages."""
+        """Expected location of the clouds, for error messages."""
         sides = self.root / "vehicle-side", self.root / "infrastructure-side"
         folders = [folder for side in sides for folder in _cloud_folders(side)]
         return "<frame>.pcd or .bin in " + ", ".join(map(str, folders))
@@ -130,7 +131,7 @@ class DAIRV2X(Dataset):
 
 
 class _Pair:
-    """One frame of the car and the frame of the roadside unit that goes with it."""
+    """One frame of the car and the associated frame of the roadside unit."""
 
     def __init__(self, vehicle: str, infrastructure: str, offset: tuple[float, float]) -> None:
         self.vehicle, self.infrastructure, self.offset = vehicle, infrastructure, offset
@@ -145,12 +146,13 @@ def _label_folders(root: Path, labels: str) -> tuple[Path, Path]:
     backup = tuple(folder.with_name(f"{folder.name}_backup") for folder in plain)
     renamed = [folder.is_dir() for folder in backup]
     if any(renamed) and not all(renamed):
-        there, absent = backup if renamed[0] else backup[::-1]
-        raise FileNotFoundError(f"DAIRV2X: {there} is there but {absent} is not: complemented labels replace both")
+        present, absent = backup if renamed[0] else backup[::-1]
+        raise FileNotFoundError(f"DAIRV2X: {present} exists but {absent} does not: complemented labels replace both")
     if labels == "complemented" and not all(renamed):
         raise FileNotFoundError(
-            f"DAIRV2X: no {backup[1]}, so {plain[1]} are the original labels; complemented labels are put there after "
-            "renaming these to *_backup (or pass labels='original', as --dataset-option labels=original to a command)"
+            f"DAIRV2X: no {backup[1]}, so {plain[1]} are the original labels; complemented labels are installed "
+            "there after renaming these to *_backup (or pass labels='original', as --dataset-option labels=original to "
+            "a command)"
         )
     return (backup[0], backup[1]) if labels == "original" and all(renamed) else plain
 
@@ -189,7 +191,7 @@ def _pairs(path: Path) -> list[_Pair]:
     for row, entry in enumerate(_read_list(path)):
         vehicle = _frame_id(path, row, entry, "vehicle_pointcloud_path")
         infrastructure = _frame_id(path, row, entry, "infrastructure_pointcloud_path")
-        offset = entry.get("system_error_offset") or {}  # "" where nobody corrected the pair
+        offset = entry.get("system_error_offset") or {}  # "" where the pair has no correction
         if not isinstance(offset, Mapping):
             raise ValueError(f"{path}: [{row}].system_error_offset must be delta_x and delta_y, got {offset!r}")
         where = f"{path}: [{row}].system_error_offset"
@@ -210,13 +212,13 @@ def _frame_id(path: Path, row: int, entry: Mapping[str, Any], field: str) -> str
 
 
 def _cloud_folders(side: Path) -> tuple[Path, ...]:
-    """Where the clouds of a side may be: in place, or as the published archives unpack, inside or beside the root."""
+    """Possible folders of the clouds of a side: in place, or of the unpacked archives, in or beside the root."""
     archive = f"cooperative-vehicle-infrastructure-{side.name}-velodyne"
     return side / "velodyne", side.parent / archive, side.parent.parent / archive
 
 
 def _points(folders: Iterable[Path], frame: str) -> Float32Array | None:
-    """The cloud of a frame, PCD or KITTI's .bin, from the first folder that has it; None if none does."""
+    """Read the cloud of a frame, PCD or KITTI's .bin, from the first folder that contains it; None if none does."""
     for folder in folders:
         if (folder / f"{frame}.pcd").is_file():
             return read_pcd(folder / f"{frame}.pcd", intensity_scale=1.0 / 255.0)
@@ -238,7 +240,7 @@ def _infrastructure(side: Path, pair: _Pair, labels: Path, classes: Collection[s
 
 
 def _calibration(path: Path) -> FloatArray:
-    """(4, 4) transform in a calibration file, which has rotation and translation at the top or under `transform`."""
+    """(4, 4) transform of a calibration file, with rotation and translation at the top level or in `transform`."""
     content = _read_json(path)
     content = content.get("transform", content) if isinstance(content, Mapping) else None
     if not isinstance(content, Mapping):
@@ -250,7 +252,7 @@ def _calibration(path: Path) -> FloatArray:
 
 
 def _array(path: Path, content: Mapping[str, Any], field: str, shape: tuple[int, ...]) -> FloatArray:
-    """The numbers of a field, of which the size counts: translations are columns, [[x], [y], [z]]."""
+    """The numbers of a field, reshaped: translations are stored as columns, [[x], [y], [z]]."""
     try:
         return np.asarray(content[field], dtype=np.float64).reshape(shape)
     except KeyError:
@@ -266,7 +268,7 @@ def _own_objects(path: Path, classes: Collection[str]) -> Boxes:
         dimensions = [_nested(where, entry, "3d_dimensions", axis) for axis in "lwh"]
         if min(dimensions) < 0:
             raise ValueError(f"{where}.3d_dimensions is negative: {dimensions}")
-        if min(dimensions) > 0:  # some labels exist in the image only and have no box
+        if min(dimensions) > 0:  # some labels are in the image only and have no box
             center.append([_nested(where, entry, "3d_location", axis) for axis in "xyz"])
             size.append(dimensions)
             yaw.append(_number(f"{where}.rotation", entry.get("rotation")))
@@ -277,8 +279,7 @@ def _own_objects(path: Path, classes: Collection[str]) -> Boxes:
 def _common_objects(path: Path, classes: Collection[str], world_SE3_ego: FloatArray) -> Boxes:
     """The cooperative labels in an agent's LiDAR frame.
 
-    The corners of a box go round its bottom from the front left one (front left, front right, rear right, rear left),
-    then round its top.
+    The corners of a box are those of the bottom (front left, front right, rear right, rear left), then of the top.
     """
     corners, kinds = [], []
     for where, kind, entry in _entries(path, classes):
@@ -304,7 +305,7 @@ def _common_objects(path: Path, classes: Collection[str], world_SE3_ego: FloatAr
 
 
 def _entries(path: Path, classes: Collection[str]) -> list[tuple[str, str, Mapping[str, Any]]]:
-    """Where, lower-case type and content of the labels of these classes."""
+    """Location for error messages, lower-case type and content of the labels of these classes."""
     entries = []
     for row, entry in enumerate(_read_list(path)):
         kind = str(entry.get("type", "")).lower()
@@ -321,7 +322,7 @@ def _nested(where: str, entry: Mapping[str, Any], field: str, axis: str) -> floa
 
 
 def _number(where: str, value: Any) -> float:
-    """A finite number, which may be written as a string."""
+    """Parse a finite number, which may be stored as a string."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -342,6 +343,6 @@ def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))  # editors on Windows add a byte-order mark
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path} is not there") from None
+        raise FileNotFoundError(f"{path} does not exist") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not readable as JSON: {error}") from None

@@ -1,4 +1,4 @@
-"""Writes frames in DAIR-V2X-C's own layout, so that whatever reads DAIR-V2X-C reads them."""
+"""Writer of frames in DAIR-V2X-C's format."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _OWN_LABELS = MappingProxyType(
 )
 _COMMON_LABELS = ("label_world_backup", "label_world")  # the last one is written last of all files of a frame
 _TYPES = MappingProxyType({"van": "Van", "truck": "Truck", "bus": "Bus", "motorcycle": "Motorcyclist"})
-"""DAIR-V2X's types of our kinds of vehicle; all others are cars."""
+"""DAIR-V2X's types by label; all others are cars."""
 _EPOCH = 1_600_000_000_000_000
-"""Of the clouds' times [us]."""
+"""Origin of the time stamps of clouds [us]."""
 
 
 class DAIRPair(NamedTuple):
-    """A cloud of the car and the one of the roadside unit that goes with it.
+    """A pair of clouds of the car and the roadside unit.
 
     Attributes:
         frame: name of the files of both, digits.
-        batch: the recording that it belongs to.
-        time: since the recording began [s].
+        batch: name of the recording.
+        time: since the start of the recording [s].
     """
 
     frame: str
@@ -46,11 +46,11 @@ class DAIRPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DAIRSide:
-    """What the car or the roadside unit had at one time.
+    """Data of the car or the roadside unit in one frame.
 
     Attributes:
         world_SE3_lidar: (4, 4) pose of its LiDAR.
-        objects: the labelled objects that it could see, in its LiDAR frame.
+        objects: the labelled objects visible to it, in its LiDAR frame.
         points: (N, 4) x, y, z [m], intensity [0, 1] in its LiDAR frame; None to store no cloud.
     """
 
@@ -60,7 +60,7 @@ class DAIRSide:
 
 
 def dair_v2x_frame_files(root: str | Path, frame: str, with_points: bool = True) -> list[Path]:
-    """All files of a frame, the one that is written last at the end."""
+    """All files of a frame; the last one is written last."""
     root = Path(root)
     calibration = [(_CAR, "novatel_to_world"), (_CAR, "lidar_to_novatel"), (_UNIT, "virtuallidar_to_world")]
     names = [f"{side}/velodyne/{frame}.pcd" for side in (_CAR, _UNIT) if with_points]
@@ -73,19 +73,18 @@ def dair_v2x_frame_files(root: str | Path, frame: str, with_points: bool = True)
 def write_dair_v2x_frame(
     root: str | Path, frame: str, vehicle: DAIRSide, infrastructure: DAIRSide, common: Boxes
 ) -> None:
-    """Write one frame of the car and the roadside unit, but no index (see `write_dair_v2x_index`).
+    """Write one frame of the car and the roadside unit, without the index (see `write_dair_v2x_index`).
 
-    The inverse of reading: `DAIRV2X` gives back poses and objects to the precision of floats, points exactly and
-    intensities to 8 bits; labels become DAIR-V2X's types, and it has no ids. Complemented and original labels are the
-    same. The car's position is that of its LiDAR, and the offset of the roadside unit zero. A file is there complete or
-    not at all.
+    The inverse of `DAIRV2X`, which reads poses and objects to floating-point precision, points exactly and intensities
+    to 8 bits; labels are converted to DAIR-V2X's types, ids are not stored. Complemented and original labels are equal.
+    The car's position is that of its LiDAR, and the offset of the roadside unit is zero. Files are written atomically.
 
     Args:
-        root: the folder with `vehicle-side`, `infrastructure-side` and `cooperative`; made if it is not there.
+        root: the folder with `vehicle-side`, `infrastructure-side` and `cooperative`; created if missing.
         frame: name of the files, digits.
-        vehicle: what the car had.
-        infrastructure: what the roadside unit had.
-        common: what both together could see, the car itself left out, in the car's LiDAR frame.
+        vehicle: data of the car.
+        infrastructure: data of the roadside unit.
+        common: the objects visible to either, without the car itself, in the car's LiDAR frame.
 
     Raises:
         ValueError: a pose is not rigid, the frame is not a number, or points are malformed.
@@ -95,18 +94,18 @@ def write_dair_v2x_frame(
         raise ValueError(f"frame must be digits, like '015438', got {frame!r}")
     sides = {_CAR: vehicle, _UNIT: infrastructure}
     poses = {side: rigid_SE3(sides[side].world_SE3_lidar, f"{side}: world_SE3_lidar") for side in sides}
-    for side, had in sides.items():
-        if had.points is not None:
-            write_pcd_intensity(root / side / "velodyne" / f"{frame}.pcd", had.points)
+    for side, data in sides.items():
+        if data.points is not None:
+            write_pcd_intensity(root / side / "velodyne" / f"{frame}.pcd", data.points)
     write_json(root / _CAR / "calib" / "novatel_to_world" / f"{frame}.json", _calibration(poses[_CAR]))
     write_json(root / _CAR / "calib" / "lidar_to_novatel" / f"{frame}.json", {"transform": _calibration(np.eye(4))})
     write_json(
         root / _UNIT / "calib" / "virtuallidar_to_world" / f"{frame}.json",
         _calibration(poses[_UNIT]) | {"relative_error": {"delta_x": 0.0, "delta_y": 0.0}},
     )
-    for side, had in sides.items():
+    for side, data in sides.items():
         for folder in _OWN_LABELS[side]:
-            write_json(root / side / folder / f"{frame}.json", _labels(had.objects))
+            write_json(root / side / folder / f"{frame}.json", _labels(data.objects))
     common_labels = _common_labels(common, poses[_CAR])
     for folder in _COMMON_LABELS:
         write_json(root / _COMMON / folder / f"{frame}.json", common_labels)
@@ -115,10 +114,10 @@ def write_dair_v2x_frame(
 def write_dair_v2x_index(root: str | Path, split: str, pairs: Sequence[DAIRPair]) -> None:
     """Add frames to the index files: `data_info.json` of both sides and of pairs, and `<split>.json`.
 
-    What is there of other frames is kept.
+    Entries of other frames are kept.
 
     Raises:
-        ValueError: an index file that is there is broken; names it.
+        ValueError: an existing index file is malformed; the message names it.
     """
     root = Path(root)
     cars, units, both = [], [], []
@@ -160,7 +159,7 @@ def write_dair_v2x_index(root: str | Path, split: str, pairs: Sequence[DAIRPair]
 
 
 def _merge(path: Path, key: str, entries: Sequence[dict[str, Any]]) -> None:
-    """Add entries to a JSON list, in the place of those with the same value under `key`."""
+    """Add entries to a JSON list, replacing those with the same value of `key`."""
     try:
         known = {str(entry[key]): entry for entry in _list(path)}
     except (TypeError, KeyError):
@@ -186,7 +185,7 @@ def _calibration(matrix: FloatArray) -> dict[str, Any]:
 
 
 def _labels(objects: Boxes) -> list[dict[str, Any]]:
-    """The labels of one side, with the fields that only images have empty."""
+    """The labels of one side; fields of the image are 0."""
     kinds = ["car"] * len(objects) if objects.label is None else objects.label.tolist()
     return [
         {
@@ -203,7 +202,7 @@ def _labels(objects: Boxes) -> list[dict[str, Any]]:
 
 
 def _common_labels(common: Boxes, world_SE3_ego: FloatArray) -> list[dict[str, Any]]:
-    """The labels in the world; corners go round the bottom from the front left one to the right, then round the top."""
+    """The labels in the world frame, with the eight corners in the order of `DAIRV2X`."""
     around = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
     unit = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in around])
     c, s = np.cos(common.yaw), np.sin(common.yaw)

@@ -1,4 +1,4 @@
-"""What every data set hands out: scenarios of frames, a frame of agents, an agent's cloud, pose and objects."""
+"""Common interface of all data sets: scenarios, frames, and the cloud, pose and objects of each agent."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ __all__ = ["AgentFrame", "Dataset", "Frame", "Scenario", "did_you_mean"]
 
 @dataclass(frozen=True, eq=False)
 class AgentFrame:
-    """One agent at one time. Files are read when a property is first used, and kept as long as this object lives.
+    """One agent in one frame. Properties are read from files at first use, and cached.
 
     Attributes:
-        read_labels: reads `world_SE3_lidar` and `objects`; they are stored together.
+        read_labels: reads `world_SE3_lidar` and `objects`, which are stored together.
         read_points: reads `points`.
-        is_infrastructure: a roadside unit, which never is the ego.
+        is_infrastructure: whether it is a roadside unit, which is never the ego.
     """
 
     read_labels: Callable[[], tuple[FloatArray, Boxes]]
@@ -35,10 +35,10 @@ class AgentFrame:
 
     @cached_property
     def points(self) -> Float32Array | None:
-        """(N, 4) x, y, z [m] and intensity [0, 1] in the agent's LiDAR frame; None where no cloud is stored.
+        """(N, 4) x, y, z [m] and intensity [0, 1] in the agent's LiDAR frame; None if no cloud is stored.
 
         Raises:
-            ValueError: the file is broken; names it.
+            ValueError: the file is malformed; the message names it.
         """
         return self.read_points()
 
@@ -50,39 +50,39 @@ class AgentFrame:
 
     @property
     def world_SE3_lidar(self) -> FloatArray:
-        """(4, 4) pose of the LiDAR in the data set's world, made right-handed; always a proper rotation.
+        """(4, 4) pose of the LiDAR in the data set's world frame, converted to right-handed axes.
 
         Raises:
-            ValueError: the file is broken; names it and the field.
-            FileNotFoundError: it is not there.
+            ValueError: the file is malformed; the message names it and the field.
+            FileNotFoundError: it does not exist.
         """
         return self._labels[0]
 
     @property
     def objects(self) -> Boxes:
-        """The objects that this agent could see, in its own LiDAR frame, labelled; its own body is not among them.
+        """The labelled objects visible to this agent, in its own LiDAR frame, without its own vehicle.
 
-        `track_id` is the data set's object id: the same for all agents of a scenario, and over its frames. It is None
-        where the data set has none (DAIR-V2X).
+        `track_id` is the data set's object id: the same for all agents and frames of a scenario. It is None if the
+        data set has no ids (DAIR-V2X).
 
         Raises:
-            ValueError: the file is broken; names it and the object.
-            FileNotFoundError: it is not there.
+            ValueError: the file is malformed; the message names it and the object.
+            FileNotFoundError: it does not exist.
         """
         return self._labels[1]
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """All agents at one time.
+    """One frame of all agents.
 
     Attributes:
         scenario: name of the scenario.
-        timestamp: name of the frame as on disk.
+        timestamp: name of the frame on disk.
         time: seconds since the first frame of the scenario.
-        agents: the agents that have this frame; vehicles first, in the order of their names.
-        read_common_objects: reads the labels made for all agents together, given `world_SE3_ego`, in the ego's LiDAR
-            frame; None where the data set has labels per agent only.
+        agents: agents with data in this frame by name; vehicles first, sorted.
+        read_common_objects: reads the labels common to all agents, given `world_SE3_ego`, in the ego's LiDAR frame;
+            None if the data set has labels per agent only.
     """
 
     scenario: str
@@ -92,18 +92,18 @@ class Frame:
     read_common_objects: Callable[[FloatArray], Boxes] | None = None
 
     def ground_truth(self, ego: str, include_ego: bool = False) -> Boxes:
-        """What all agents together could see, in the LiDAR frame of `ego`: the truth of cooperative perception.
+        """The objects visible to any agent, in the LiDAR frame of `ego`: the ground truth of cooperative perception.
 
-        This is the union over agents by object id, where the ego's own label of an object wins; for DAIR-V2X it is the
-        cooperative label file.
+        The union over agents by object id, where the ego's own label of an object has priority. For DAIR-V2X, the
+        objects of the cooperative label file.
 
         Args:
             ego: name of an agent.
-            include_ego: keep the box of the ego itself, labelled by the others. It is told by standing on the ego's
-                LiDAR, as not all data sets name agents by object id.
+            include_ego: keep the box of the ego itself, as labelled by others. It is the box that contains the ego's
+                LiDAR, since not all data sets name agents by object id.
 
         Raises:
-            ValueError: no such agent; or a file is broken.
+            ValueError: unknown agent, or a malformed file.
         """
         if ego not in self.agents:
             raise ValueError(f"frame {self.timestamp} of {self.scenario} has no agent {did_you_mean(ego, self.agents)}")
@@ -123,7 +123,7 @@ class Frame:
 
 
 class Scenario(Sequence[Frame]):
-    """The frames of one drive in the order of time; each is made anew, with nothing read, when it is asked for."""
+    """The frames of one recording in temporal order; indexing creates a new `Frame` without reading its files."""
 
     def __init__(self, name: str, frame_count: int, make_frame: Callable[[int], Frame]) -> None:
         """Frames `make_frame(0)` to `make_frame(frame_count - 1)`."""
@@ -151,7 +151,7 @@ class Scenario(Sequence[Frame]):
 
 
 class Dataset(ABC):
-    """A split of a data set: its scenarios by name. Iterating gives the scenarios; `len` is how many there are.
+    """A split of a data set: a collection of scenarios, indexed by name. Iterating yields the scenarios.
 
     Attributes:
         scenarios: names of the scenarios, sorted.
@@ -165,18 +165,18 @@ class Dataset(ABC):
 
     @abstractmethod
     def __init__(self, root: str | Path, split: str) -> None:
-        """Look at which scenarios the split of this name has, in the data set kept at `root`."""
+        """List the scenarios of a split of the data set at `root`."""
 
     @property
     def cloud_location(self) -> str:
-        """Where the files of the clouds are expected, for error messages."""
+        """Expected location of the clouds, for error messages."""
         return f"the clouds of {self!r}"
 
     def __getitem__(self, name: str) -> Scenario:
         """The scenario of this name.
 
         Raises:
-            ValueError: there is none; names the nearest.
+            ValueError: unknown name; the message suggests the most similar one.
         """
         if name not in self.scenarios:
             raise ValueError(f"{self}: no scenario {did_you_mean(name, self.scenarios)}")
@@ -193,7 +193,7 @@ class Dataset(ABC):
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """The end of an error line: the name as given, the nearest valid one, and all of them if they are few."""
+    """Suffix of an error message: the given name, the most similar valid one, and all valid ones if they are few."""
     names = [str(candidate) for candidate in valid]
     nearest = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)
     listed = f" (there are: {', '.join(names)})" if 1 < len(names) <= 8 else ""
@@ -202,5 +202,5 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 def _ids(boxes: Boxes) -> IntArray:
     if boxes.track_id is None:
-        raise ValueError("the union of what agents see needs objects with a track_id")
+        raise ValueError("the union of the objects of all agents needs objects with a track_id")
     return boxes.track_id

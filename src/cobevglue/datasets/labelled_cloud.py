@@ -1,4 +1,4 @@
-"""One cloud with the objects in it: what detectors are trained and measured on."""
+"""Point clouds with labelled objects, for training and evaluation of detectors."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ __all__ = ["LabelledCloud", "count_points", "points_at"]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelledCloud:
-    """One cloud and the objects in it.
+    """A point cloud with labelled objects.
 
     Attributes:
         points: (N, 4) x, y, z [m] and intensity [0, 1] in the sensor's frame.
         boxes: K objects in the same frame.
-        point_count: (K,) points on each object.
+        point_count: (K,) number of points on each object.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: wrong shapes.
     """
 
     points: Float32Array
@@ -38,17 +38,17 @@ class LabelledCloud:
 
 
 def points_at(points: Float32Array, boxes: Boxes, margin: float = 0.0) -> Iterator[tuple[IntArray, FloatArray]]:
-    """For each box the points that it holds seen from above, its edge included, at any height.
+    """The points inside the bird's-eye-view rectangle of each box, border included, at any height.
 
     Args:
         points: (N, 4) x, y, z [m], intensity.
         boxes: K boxes in the same frame.
-        margin: by how much boxes are enlarged on every side [m].
+        margin: enlargement of the boxes on every side [m].
 
     Yields:
         (n,) rows of these points, and (n, 3) x, y, z [m] from the box's centre, x along its heading.
     """
-    order = np.argsort(points[:, 0])  # so that a box looks only at the slab of points that it spans in x
+    order = np.argsort(points[:, 0])  # so that each box is compared only with the slab of points in its x range
     x, y = points[order, 0], points[order, 1]
     reach = np.hypot(boxes.size[:, 0] / 2.0 + margin, boxes.size[:, 1] / 2.0 + margin)
     first = np.searchsorted(x, boxes.center[:, 0] - reach, side="left")
@@ -62,11 +62,11 @@ def points_at(points: Float32Array, boxes: Boxes, margin: float = 0.0) -> Iterat
 
 
 def count_points(points: Float32Array, boxes: Boxes) -> IntArray:
-    """Points in each box, its surface included.
+    """Count the points in each box, surface included.
 
     Args:
         points: (N, 4) x, y, z [m], intensity.
-        boxes: K boxes in the same frame; one of unknown height (0) counts the points at any height.
+        boxes: K boxes in the same frame; for boxes of unknown height (0), points at any height are counted.
 
     Returns:
         (K,) counts.

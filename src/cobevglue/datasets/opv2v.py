@@ -1,8 +1,8 @@
-"""OPV2V and V2XSet: simulated (CARLA, 10 Hz), poses exact, object ids the same for all agents of a scenario.
+"""OPV2V and V2XSet: simulated (CARLA, 10 Hz), with exact poses and object ids common to all agents of a scenario.
 
-Both are left-handed on disk. A yaml file lists the objects that at least one point of its agent hit, in the world
-frame: location, box centre offset, half extents and angle [roll, yaw, pitch]. Objects are moved to the LiDAR frame of
-their agent in three dimensions and then set upright.
+Both are left-handed on disk. A yaml file lists the objects with at least one point of its agent, in the world frame:
+location, box centre offset, half extents and angle [roll, yaw, pitch]. Objects are transformed to the LiDAR frame of
+their agent in three dimensions; then roll and pitch are dropped.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ __all__ = ["OPV2V", "V2XSet", "read_opv2v_labels"]
 class OPV2V(YamlTree):
     """OPV2V: `OPV2V(root, split="test_culvercity")["TwoCars_1"]` is a scenario, a sequence of frames.
 
-    `root` holds the splits as folders; a split written by `cobevglue simulate` is read by its own name. Nothing but
-    folder listings is read before a frame's cloud, pose or objects are used.
+    `root` contains the splits as folders, also those written by `cobevglue simulate`. Only folders are listed until the
+    cloud, pose or objects of a frame are used.
     """
 
     splits: ClassVar[tuple[str, ...]] = ("train", "validate", "test", "test_culvercity")
@@ -38,23 +38,23 @@ class OPV2V(YamlTree):
 
 
 class V2XSet(OPV2V):
-    """V2XSet: OPV2V's tree with roadside units, whose agent ids are negative (`is_infrastructure`)."""
+    """V2XSet: OPV2V's folder structure with roadside units, whose agent ids are negative (`is_infrastructure`)."""
 
     splits: ClassVar[tuple[str, ...]] = ("train", "validate", "test")
 
 
 def read_opv2v_labels(path: Path) -> tuple[FloatArray, Boxes]:
-    """Pose and objects in a yaml file of OPV2V or V2XSet.
+    """Read pose and objects from a yaml file of OPV2V or V2XSet.
 
     Args:
         path: the file.
 
     Returns:
-        world_SE3_lidar (4, 4), a proper rotation, and the objects in the LiDAR frame with ids and labels.
+        world_SE3_lidar (4, 4), and the objects in the LiDAR frame with ids and labels.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it is broken; names the file, the object and the field.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is malformed; the message names the file, the object and the field.
     """
     lidar_pose, table = read_objects(path)
     world_SE3_lidar = _lidar_pose(path, lidar_pose)
@@ -73,7 +73,7 @@ def read_opv2v_labels(path: Path) -> tuple[FloatArray, Boxes]:
 
 
 def _lidar_pose(path: Path, lidar_pose: ArrayLike) -> FloatArray:
-    """Six numbers, or a 4x4 matrix as some redistributions of the data have it."""
+    """Parse a pose of six numbers, or a 4x4 matrix as in some redistributions of the data."""
     try:
         values = np.asarray(lidar_pose, dtype=np.float64)
     except (TypeError, ValueError) as error:

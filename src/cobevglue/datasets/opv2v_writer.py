@@ -1,4 +1,4 @@
-"""Writes frames in OPV2V's own layout, so that whatever reads OPV2V reads them."""
+"""Writer of frames in OPV2V's format."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ def write_opv2v_frame(
     world_SE3_vehicle: ArrayLike | None = None,
     point_counts: Mapping[int, int] | None = None,
 ) -> None:
-    """Write what one agent had at one time: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
+    """Write one frame of one agent: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
 
-    The inverse of reading: `OPV2V` gives back pose and objects to the precision of floats, points exactly and
-    intensities to 8 bits. Axes are mirrored to OPV2V's left-handed ones. Labels are kept under `obj_type`. A file is
-    there complete or not at all.
+    The inverse of `OPV2V`, which reads pose and objects to floating-point precision, points exactly and intensities to
+    8 bits. Axes are mirrored to OPV2V's left-handed ones. Labels are stored as `obj_type`. Files are written
+    atomically.
 
     Args:
-        agent_folder: `<root>/<split>/<scenario>/<agent>`; made if it is not there. Roadside units have negative names.
-        timestamp: file number as text, digits only; frames 0.1 s apart are numbered 2 apart, as OPV2V does.
+        agent_folder: `<root>/<split>/<scenario>/<agent>`; created if missing. Roadside units have negative names.
+        timestamp: file number, digits only; frames 0.1 s apart are numbered 2 apart, as in OPV2V.
         world_SE3_lidar: (4, 4) right-handed pose of the LiDAR.
-        objects: the objects that the agent could see, in its LiDAR frame, with `track_id`.
+        objects: the objects visible to the agent, in its LiDAR frame, with `track_id`.
         points: (N, 4) x, y, z [m], intensity [0, 1] in the LiDAR frame; None to store no cloud.
-        speeds: km/h of objects by id; 0 where left out.
-        ego_speed: km/h of the agent.
-        world_SE3_vehicle: (4, 4) right-handed pose of the vehicle on the ground; that of the LiDAR where left out.
-        point_counts: how many of the cloud's points lie on objects, by id; kept under `points`, which OPV2V has not.
+        speeds: of objects by id [km/h]; 0 by default.
+        ego_speed: of the agent [km/h].
+        world_SE3_vehicle: (4, 4) right-handed pose of the vehicle on the ground; by default that of the LiDAR.
+        point_counts: number of points of the cloud on each object by id; stored as `points`, an extension of OPV2V.
 
     Raises:
         ValueError: a pose is not rigid, the timestamp is not a number, objects have no ids, or points are malformed.
@@ -63,7 +63,7 @@ def write_opv2v_frame(
     vehicle = lidar if world_SE3_vehicle is None else rigid_SE3(world_SE3_vehicle, "world_SE3_vehicle")
     poses = carla_from_SE3(lidar @ _lidar_SE3_object(objects))
     offset = np.zeros((len(objects), 3))
-    offset[:, 2] = objects.size[:, 2] / 2  # OPV2V's location is on the ground, its `center` lifts it to the box centre
+    offset[:, 2] = objects.size[:, 2] / 2  # OPV2V's location is on the ground, `center` is the offset of the box centre
     vehicles: dict[int, dict[str, Any]] = {}
     for row, track_id in enumerate(objects.track_id.tolist()):
         vehicles[track_id] = {

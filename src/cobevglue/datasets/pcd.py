@@ -1,4 +1,4 @@
-"""LiDAR clouds in PCD files: ASCII, binary and binary_compressed, with the intensity where the data sets hide it."""
+"""LiDAR clouds in PCD files (ASCII, binary and binary_compressed) and KITTI's binary files."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ __all__ = ["read_bin", "read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
 
 
 def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float = 1.0) -> Float32Array:
-    """Points of a PCD file; those with a coordinate that is not finite (no return) are left out.
+    """Read the points of a PCD file; those with non-finite coordinates (no return) are omitted.
 
-    OPV2V was written through Open3D, which knows no intensity: it is the red byte of the packed colour `rgb`, a 32-bit
-    integer stored under the type float. In ASCII files that shows as numbers like 1.5e-38.
+    OPV2V was written with Open3D, which does not support intensity: it is the red byte of the packed colour `rgb`, a
+    32-bit integer stored with the type float. In ASCII files these are numbers like 1.5e-38.
 
     Args:
-        path: the file, with fields x, y, z and either `intensity`, or `rgb`; with neither the intensity is 0. A NaN
-            intensity becomes 0.
-        left_handed: the file has y to the right: mirror it.
-        intensity_scale: factor that brings the field `intensity` to [0, 1]. Not applied to `rgb`, which is 8 bit.
+        path: the file, with fields x, y, z and either `intensity` or `rgb`; with neither, the intensity is 0. NaN
+            intensities become 0.
+        left_handed: the y axis of the file points to the right; it is mirrored.
+        intensity_scale: factor from the field `intensity` to [0, 1]. Not applied to `rgb`, which is 8 bit.
 
     Returns:
         (N, 4) x, y, z [m], intensity in [0, 1]; x forward, y left, z up.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it cannot be read as PCD, or is shorter than its header says; names the file.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is not valid PCD, or is shorter than its header states; the message names the file.
     """
     data = _columns(Path(path))
     names = data.dtype.names or ()
@@ -42,7 +42,7 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
     if missing:
         raise ValueError(f"{path}: no field {missing[0]!r} among the fields {', '.join(names)}")
     points = np.zeros((len(data), 4), dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # of doubles beyond single precision; they are left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond the range of float32 are omitted below
         for column, name in enumerate(("x", "y", "z")):
             points[:, column] = data[name]
     if left_handed:
@@ -59,28 +59,28 @@ def read_pcd(path: str | Path, left_handed: bool = False, intensity_scale: float
 
 
 def read_bin(path: Path) -> Float32Array:
-    """Points of a file as KITTI stores clouds: x, y, z [m] and intensity of each point as little-endian float32.
+    """Read the points of a file in KITTI's format: x, y, z [m] and intensity of each point as little-endian float32.
 
-    KITTI's intensities, and those that DAIR-V2X's converter writes, are in [0, 1]. Where the largest of a file is above
-    1, they are the sensor's own 0 to 255 and divided by 255.
+    The intensities of KITTI and of DAIR-V2X's converter are in [0, 1]. If the maximum of a file is above 1, they are
+    raw values from 0 to 255 and divided by 255.
 
     Args:
         path: the file.
 
     Returns:
-        (N, 4) x, y, z [m], intensity in [0, 1], without points that have a coordinate that is not finite.
+        (N, 4) x, y, z [m], intensity in [0, 1], without points with non-finite coordinates.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it is empty, or its size is no multiple of 16 bytes; names the file.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is empty, or its size is not a multiple of 16 bytes; the message names the file.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is not there")
+        raise FileNotFoundError(f"{path} does not exist")
     size = path.stat().st_size
     if size == 0:
         raise ValueError(f"{path}: is empty (0 bytes)")
     if size % 16:
-        raise ValueError(f"{path}: {size} bytes are no whole number of points of 4 float32")
+        raise ValueError(f"{path}: {size} bytes are not a multiple of 16 (points of 4 float32)")
     points = np.fromfile(path, dtype="<f4").reshape(-1, 4).astype(np.float32)
     points = _finite(points)
     if (points[:, 3] > 1.0).any():
@@ -90,18 +90,18 @@ def read_bin(path: Path) -> Float32Array:
 
 
 def _finite(points: Float32Array) -> Float32Array:
-    """The points whose coordinates are finite; an intensity that is not finite becomes 0."""
+    """The points with finite coordinates; non-finite intensities become 0."""
     points[~np.isfinite(points[:, 3]), 3] = 0.0
     return points[np.isfinite(points[:, :3]).all(axis=1)]
 
 
 def write_pcd_rgb(path: Path, points: ArrayLike, left_handed: bool = True) -> None:
-    """Write a cloud the way OPV2V stores it: binary PCD, the intensity in the red byte of `rgb`.
+    """Write a cloud in OPV2V's format: binary PCD, the intensity in the red byte of `rgb`.
 
     Args:
-        path: the file; an existing one is replaced, when all is written.
+        path: the file, replaced atomically if it exists.
         points: (N, 4) x, y, z [m], y to the left, and intensity in [0, 1], of which 8 bits are kept.
-        left_handed: the file has y to the right, as OPV2V's: mirror the points.
+        left_handed: write the y axis to the right, as in OPV2V.
 
     Raises:
         ValueError: the points have another shape, are not finite, or an intensity is not in [0, 1].
@@ -113,10 +113,10 @@ def write_pcd_rgb(path: Path, points: ArrayLike, left_handed: bool = True) -> No
 
 
 def write_pcd_intensity(path: Path, points: ArrayLike) -> None:
-    """Write a cloud the way a real sensor's is stored: binary PCD, y to the left, `intensity` from 0 to 255.
+    """Write a cloud in the format of real sensors: binary PCD, y to the left, `intensity` from 0 to 255.
 
     Args:
-        path: the file; an existing one is replaced, when all is written.
+        path: the file, replaced atomically if it exists.
         points: (N, 4) x, y, z [m] and intensity in [0, 1], of which 8 bits are kept.
 
     Raises:
@@ -127,7 +127,7 @@ def write_pcd_intensity(path: Path, points: ArrayLike) -> None:
 
 
 def _checked_cloud(points: ArrayLike) -> tuple[Float32Array, Float32Array]:
-    """The cloud, and its (N,) intensities as whole numbers from 0 to 255."""
+    """Validate a cloud; returns it and its (N,) intensities as integers from 0 to 255."""
     cloud = np.asarray(points, dtype=np.float32)
     if cloud.ndim != 2 or cloud.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4), got {cloud.shape}")
@@ -150,23 +150,23 @@ def _columns(path: Path) -> np.ndarray[tuple[int], np.dtype[Any]]:
     from pypcd4.pypcd4 import PointCloud
 
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is not there")
+        raise FileNotFoundError(f"{path} does not exist")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of an empty table; the count below says more
+            warnings.simplefilter("ignore")  # numpy warns of empty tables; the count is checked below
             cloud = PointCloud.from_fileobj(io.BufferedReader(io.BytesIO(_with_counts(path.read_bytes()))))
         # (a table of one row loses its axis in numpy's text reader)
         data: np.ndarray[tuple[int], np.dtype[Any]] = np.atleast_1d(cloud.pc_data)
-        promised = int(cloud.metadata.points)
+        expected = int(cloud.metadata.points)
     except ValidationError as error:  # of the header
         absent = [str(problem["loc"][0]).upper() for problem in error.errors() if problem["type"] == "missing"]
         first = error.errors()[0]
         why = f"the header has no {', '.join(absent)}" if absent else f"{first['loc'][0]}: {first['msg']}"
         raise ValueError(f"{path}: not readable as PCD: {why}") from None
-    except Exception as error:  # a parser of foreign bytes: struct, lzf, numpy and lookup errors
+    except Exception as error:  # malformed bytes raise struct, lzf, numpy and lookup errors in the parser
         raise ValueError(f"{path}: not readable as PCD: {' '.join(str(error).split())[:200]}") from None
-    if len(data) != promised:
-        raise ValueError(f"{path}: the header promises {promised} points, the file has {len(data)}")
+    if len(data) != expected:
+        raise ValueError(f"{path}: the header states {expected} points, the file has {len(data)}")
     return data
 
 
@@ -177,7 +177,7 @@ def _with_counts(content: bytes) -> bytes:
     """
     data = re.search(rb"(?m)^DATA\b", content)
     if data is None:
-        return content  # the parser says what is missing
+        return content  # the parser reports what is missing
     start = data.start()
     lines = content[:start].split(b"\n")
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
@@ -191,7 +191,7 @@ def _with_counts(content: bytes) -> bytes:
     try:
         table = {name: [header[name][row] for row in kept] for name in (b"FIELDS", b"SIZE", b"TYPE")}
     except (KeyError, IndexError):
-        return content  # the parser says what is missing
+        return content  # the parser reports what is missing
     table[b"COUNT"] = [b"1" if counts is None else counts[row] for row in kept]
     rows = [b" ".join([name, *values]) for name, values in table.items()]
     rest = [line for line in lines if line.split() and line.split()[0] not in table]

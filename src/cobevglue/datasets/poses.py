@@ -1,8 +1,8 @@
-"""Poses of left-handed data sets and boxes given in three dimensions, brought to the axes used everywhere else.
+"""Conversion of poses and boxes of left-handed data sets to the right-handed axes of the package.
 
-Inside the package axes are right-handed: x forward, y left, z up. CARLA's are left-handed: x forward, y right, z up;
-its yaw turns x towards y (clockwise seen from above), its pitch lifts the nose. Mirroring y turns one into the other:
-a transform T becomes M T M with M = diag(1, -1, 1, 1), which is again a proper rotation.
+The axes of the package are x forward, y left, z up. CARLA's are left-handed: x forward, y right, z up; its yaw rotates
+x towards y (clockwise seen from above), its pitch raises the front. Mirroring y converts one into the other: a
+transform T becomes M T M with M = diag(1, -1, 1, 1), which is again a proper rotation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["SE3_from_carla", "carla_from_SE3", "inverse_SE3", "mirrored", "rigid
 
 
 def SE3_from_carla(pose: ArrayLike) -> FloatArray:
-    """Right-handed transforms from CARLA poses.
+    """Convert CARLA poses to right-handed transforms.
 
     Args:
         pose: (..., 6) x, y, z [m], roll, yaw, pitch [degrees] (note the order), left-handed, as stored by OPV2V.
@@ -26,8 +26,8 @@ def SE3_from_carla(pose: ArrayLike) -> FloatArray:
     """
     pose = np.asarray(pose, dtype=np.float64)
     roll, yaw, pitch = np.moveaxis(np.deg2rad(pose[..., 3:]), -1, 0)
-    # CARLA's rotation is Rz(yaw) Ry(-pitch) Rx(-roll), written with the usual elementary matrices. Mirroring y reverses
-    # the turns about x and z and keeps those about y: Rz(-yaw) Ry(-pitch) Rx(roll).
+    # CARLA's rotation is Rz(yaw) Ry(-pitch) Rx(-roll) in the usual elementary matrices. Mirroring y reverses the
+    # rotations about x and z and keeps those about y: Rz(-yaw) Ry(-pitch) Rx(roll).
     yaw, pitch = -yaw, -pitch
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     matrix = np.zeros((*pose.shape[:-1], 4, 4))
@@ -40,7 +40,7 @@ def SE3_from_carla(pose: ArrayLike) -> FloatArray:
 
 
 def carla_from_SE3(matrix: ArrayLike) -> FloatArray:
-    """CARLA poses of right-handed transforms: the inverse of `SE3_from_carla`.
+    """Convert right-handed transforms to CARLA poses: the inverse of `SE3_from_carla`.
 
     Args:
         matrix: (..., 4, 4) proper rigid transforms.
@@ -57,21 +57,21 @@ def carla_from_SE3(matrix: ArrayLike) -> FloatArray:
 
 
 def mirrored(matrix: ArrayLike) -> FloatArray:
-    """Transforms (..., 4, 4) with the y axis of both frames turned round: M T M, from left- to right-handed or back."""
+    """Mirror the y axis of both frames of transforms (..., 4, 4): M T M, from left- to right-handed or back."""
     signs = np.array([1.0, -1.0, 1.0, 1.0])
     result: FloatArray = np.asarray(matrix, dtype=np.float64) * np.outer(signs, signs)
     return result
 
 
 def rigid_SE3(matrix: ArrayLike, name: str = "the matrix") -> FloatArray:
-    """The proper rigid transform next to a stored (4, 4) matrix: its rotation is made exactly orthonormal.
+    """Orthonormalise a stored (4, 4) matrix to the nearest proper rigid transform.
 
     Args:
         matrix: the stored matrix.
-        name: what error messages call it.
+        name: its name in error messages.
 
     Raises:
-        ValueError: another shape, a value that is not finite, or a matrix further than rounding from a rigid transform.
+        ValueError: another shape, non-finite values, or a matrix that is not rigid within rounding.
     """
     try:
         m = np.array(matrix, dtype=np.float64)
@@ -94,7 +94,7 @@ def rigid_SE3(matrix: ArrayLike, name: str = "the matrix") -> FloatArray:
 
 
 def inverse_SE3(matrix: FloatArray) -> FloatArray:
-    """The inverse (..., 4, 4) of rigid transforms (..., 4, 4)."""
+    """Invert rigid transforms (..., 4, 4)."""
     inverse = np.zeros_like(matrix)
     inverse[..., :3, :3] = np.swapaxes(matrix[..., :3, :3], -1, -2)
     inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", inverse[..., :3, :3], matrix[..., :3, 3])
@@ -103,16 +103,16 @@ def inverse_SE3(matrix: FloatArray) -> FloatArray:
 
 
 def upright_yaw(matrix: FloatArray) -> FloatArray:
-    """Heading [rad] of bodies with these poses (..., 4, 4), seen from above: roll and pitch are dropped."""
+    """Yaw [rad] of poses (..., 4, 4) in bird's-eye view: roll and pitch are dropped."""
     yaw: FloatArray = np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0])
     return yaw
 
 
 def transform_boxes(boxes: Boxes, dst_SE3_src: FloatArray) -> Boxes:
-    """Boxes given in src in the dst frame, upright there.
+    """Transform boxes from the src to the dst frame, upright there.
 
-    Unlike `Boxes.transform` this takes the full spatial transform, with which two agents on a slope still agree on
-    the heights. What the transform tilts is flattened.
+    Unlike `Boxes.transform`, this applies the full spatial transform, so that heights agree between agents on a slope.
+    Roll and pitch of the result are dropped.
 
     Args:
         boxes: N boxes in the src frame.

@@ -1,8 +1,8 @@
-"""YAML files, read safely: nothing in a file can run code, numpy arrays and numbers included.
+"""Safe reader of YAML files with numpy arrays and scalars: no code of a file is executed.
 
-V2V4Real (and files written by scripts that dump numpy values) tag arrays the way PyYAML's full dumper does, as calls to
-numpy's pickle helpers. The usual answer is an unsafe loader, which would run any call named in the file. Here just
-these helpers, with numeric types only, are understood and decoded; every other tag is an error.
+V2V4Real (and files written by scripts that dump numpy values) tag arrays as PyYAML's full dumper does, as calls to
+numpy's pickle helpers. They are usually read with an unsafe loader, which would run any call named in the file. Here
+only these helpers are decoded, with numeric types only; every other tag is an error.
 """
 
 from __future__ import annotations
@@ -28,24 +28,25 @@ _TOP_LEVEL_KEY = re.compile(r"(?m)^(?=[A-Za-z_]\w*:)")
 
 
 def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
-    """The top-level mapping of a YAML file.
+    """Read the top-level mapping of a YAML file.
 
     Args:
         path: the file.
-        keys: the top-level keys of interest; others may be left out of the result, unparsed, which saves time on files
-            that hold much more (cameras, planned trajectories).
+        keys: the top-level keys to read; others may be skipped without parsing, which saves time on files with much
+            other content (cameras, planned trajectories).
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it is not YAML, not a mapping, repeats a key, or has a tag that is not plain data; names the file.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is not YAML, not a mapping, repeats a key, or has a tag that is not plain data; the message
+            names the file.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")  # a byte-order mark is no part of the first key
+        text = path.read_text(encoding="utf-8-sig")  # a byte-order mark is not part of the first key
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path} is not there") from None
+        raise FileNotFoundError(f"{path} does not exist") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not a text file: {error}") from None
-    # An alias may point to an anchor in another block, so such files are read whole.
+    # An alias may refer to an anchor in another block, so files with aliases are parsed completely.
     if not re.search(r"(?m)(?:[:-] |^)[&*]\w", text):
         blocks = _TOP_LEVEL_KEY.split(text)
         text = "".join(block for block in blocks if block.partition(":")[0] in keys) or text
@@ -59,7 +60,7 @@ def read_yaml(path: Path, keys: Collection[str]) -> dict[str, Any]:
 
 
 class _NumpySafeLoader(_SafeLoader):
-    """The safe loader plus tuples and numeric numpy arrays, scalars and types; a key that is repeated is an error."""
+    """Safe loader with tuples and numeric numpy arrays, scalars and types; repeated keys are an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         pairs = node.value
@@ -73,11 +74,11 @@ class _NumpySafeLoader(_SafeLoader):
 
 
 class _NdarrayName:
-    """Stands for the name `numpy.ndarray` in a file."""
+    """Placeholder of the name `numpy.ndarray` in a file."""
 
 
 def _parts(loader: Any, node: yaml.Node) -> tuple[list[Any], Any]:
-    """Arguments and state of a tagged call: written as a mapping, or as a plain sequence of arguments."""
+    """Arguments and state of a tagged call, written as a mapping or as a sequence of arguments."""
     if isinstance(node, yaml.MappingNode):
         call: dict[Hashable, Any] = loader.construct_mapping(node, deep=True)
         if not set(call) <= {"args", "state"}:
@@ -94,7 +95,7 @@ def _dtype(loader: Any, node: yaml.Node) -> np.dtype[Any]:
     args, state = _parts(loader, node)
     name = args[0] if args else None
     if not isinstance(name, str) or re.fullmatch(r"[fiu][248]|[iub]1", name) is None:
-        raise _bad(node, f"has the type {name!r}, which is no plain number")
+        raise _bad(node, f"has the type {name!r}, which is not a plain number")
     order = state[1] if isinstance(state, tuple | list) and len(state) > 1 else "="
     if order not in ("<", ">", "=", "|"):
         raise _bad(node, f"has the byte order {order!r}")

@@ -1,8 +1,8 @@
-"""Text files of multi-object tracking in the layout of AB3DMOT: boxes per frame, detected or labelled.
+"""Text files of multi-object tracking in AB3DMOT's format: detected or labelled boxes by frame.
 
-Every reader returns one `Boxes` a frame, for frames 0 to `frame_count - 1`, empty ones included, so that sequences of
-several files (two agents; detections and labels) go side by side: `frame_count` is by default the last frame in the
-file plus one, and `count_frames` gives that over several files.
+Every reader returns one `Boxes` per frame, for frames 0 to `frame_count - 1` including empty ones, so that sequences of
+several files (two agents; detections and labels) correspond: `frame_count` is by default the last frame in the file
+plus one, and `count_frames` gives that over several files.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ def read_v2v4real_detections(
 
     Args:
         path: the file.
-        frame_count: how many frames to return.
-        left_handed: take y as to the right, and mirror (the text of `cobevglue.datasets.v2v4real` says why not).
+        frame_count: number of frames to return.
+        left_handed: the y axis points to the right; it is mirrored (see `cobevglue.datasets.v2v4real` for the default).
 
     Returns:
         A `Boxes` with score and label per frame.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
+        FileNotFoundError: the file does not exist.
+        ValueError: a malformed line, or a frame beyond `frame_count`; the message names the file and the line.
     """
     return _read_detections(path, partial(_v2v4real_box, left_handed), frame_count)
 
@@ -76,35 +76,35 @@ def read_v2v4real_labels(
 
     Args:
         path: the file.
-        frame_count: how many frames to return.
-        left_handed: take y as to the right, and mirror.
+        frame_count: number of frames to return.
+        left_handed: the y axis points to the right; it is mirrored.
 
     Returns:
         A `Boxes` with track_id and label per frame.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: a line is broken or repeats an id in its frame; names the file and the line.
+        FileNotFoundError: the file does not exist.
+        ValueError: a malformed line or an id repeated in a frame; the message names the file and the line.
     """
     return _read_labels(path, partial(_v2v4real_box, left_handed), frame_count)
 
 
 def read_kitti_detections(path: str | Path, frame_count: int | None = None) -> list[Boxes]:
-    """Detections on a KITTI tracking sequence, in a frame at the camera with x forward, y left, z up.
+    """Detections of a KITTI tracking sequence, in a frame at the camera with x forward, y left, z up.
 
     A line is `frame,type,` four numbers of the box in the image, `score,h,w,l,x,y,z,rotation_y,alpha` in camera
-    coordinates. Scores are the detector's own and not confined to [0, 1].
+    coordinates. Scores are the detector's own and not limited to [0, 1].
 
     Args:
         path: the file.
-        frame_count: how many frames to return.
+        frame_count: number of frames to return.
 
     Returns:
         A `Boxes` with score and label per frame.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: a line is broken; names the file and the line. Also a frame beyond `frame_count`.
+        FileNotFoundError: the file does not exist.
+        ValueError: a malformed line, or a frame beyond `frame_count`; the message names the file and the line.
     """
     return _read_detections(path, _kitti_box, frame_count)
 
@@ -118,15 +118,15 @@ def read_kitti_labels(
 
     Args:
         path: the file.
-        classes: the classes to keep, in any case; "DontCare" regions have no box in space.
-        frame_count: how many frames to return.
+        classes: the classes to keep, case-insensitive; "DontCare" regions have no 3D box.
+        frame_count: number of frames to return.
 
     Returns:
         A `Boxes` with track_id and lower-case label per frame.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: a line is broken or repeats an id in its frame; names the file and the line.
+        FileNotFoundError: the file does not exist.
+        ValueError: a malformed line or an id repeated in a frame; the message names the file and the line.
     """
     return _read_labels(path, _kitti_box, frame_count, {name.lower() for name in classes})
 
@@ -139,16 +139,16 @@ def _v2v4real_box(
 
 
 def _kitti_box(height: float, width: float, length: float, x: float, y: float, z: float, rotation_y: float) -> _Box:
-    """Camera axes are x right, y down, z forward; the location is the middle of the box's bottom.
+    """Convert from camera axes: x right, y down, z forward; the location is the centre of the bottom of the box.
 
-    At rotation_y = 0 the box heads to camera x; a positive one turns it towards the camera, from x to -z. So the
-    heading is (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
+    At rotation_y = 0 the heading is along camera x; positive angles rotate it from x to -z. The heading is thus
+    (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
     """
     return _Box((z, -x, -y + height / 2), (length, width, height), -rotation_y - math.pi / 2)
 
 
 def _read_detections(path: str | Path, box: Callable[..., _Box], frame_count: int | None) -> list[Boxes]:
-    """`box` makes a box of the seven numbers from the height on."""
+    """`box` converts the seven numbers from the height on to a box."""
 
     def parse(words: list[str]) -> _Row:
         kind, _, _, _, _, score, *numbers, _ = _floats(words[1:])
@@ -160,7 +160,7 @@ def _read_detections(path: str | Path, box: Callable[..., _Box], frame_count: in
 def _read_labels(
     path: str | Path, box: Callable[..., _Box], frame_count: int | None, classes: Collection[str] | None = None
 ) -> list[Boxes]:
-    """`box` makes a box of the seven numbers from the height on; `classes` in lower case, None for all."""
+    """`box` converts the seven numbers from the height on to a box; `classes` in lower case, None for all."""
 
     def parse(words: list[str]) -> _Row | None:
         label = words[2].lower()
@@ -229,11 +229,11 @@ def _boxes(rows: list[_Row]) -> Boxes:
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Number, from 1, and words of the lines that are not blank; separated by commas or by spaces."""
+    """Line number, from 1, and words (separated by commas or spaces) of the non-blank lines."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path} is not there") from None
+        raise FileNotFoundError(f"{path} does not exist") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not a text file: {error}") from None
     return [(n, line.replace(",", " ").split()) for n, line in enumerate(text.splitlines(), 1) if line.strip()]

@@ -1,17 +1,17 @@
-"""V2V4Real: two real cars, 10 Hz, poses with some error of their own.
+"""V2V4Real: two real cars, 10 Hz, poses with localisation errors.
 
-The tree and the keys are OPV2V's, with these differences:
+Folder structure and keys are those of OPV2V, with these differences:
 
 - `lidar_pose` is a 4x4 matrix, dumped as a numpy array.
-- Objects are in the agent's own LiDAR frame, not in the world. The other car is among them.
-- An object's id is the agent's own; `ass_id` is the common one, -1 where the object was not associated.
-- `obj_type` says what it is; pedestrians are not part of the benchmark and are left out.
+- Objects are in the agent's own LiDAR frame, not in the world frame. The other car is among them.
+- The object id is specific to the agent; `ass_id` is common to both, -1 if the object was not associated.
+- `obj_type` is the class; pedestrians are not part of the benchmark and are omitted.
 
-**Handedness.** The usual tools treat the data as left-handed (y to the right), a heritage of OPV2V, and the author of
-the tracking files calls them so too. The data say otherwise: they were recorded in right-hand traffic (Columbus, Ohio),
-and in the tracking labels nearly all cars that head towards the ego car pass it at positive y, while those overtaken or
-parked at the roadside are passed at negative y (`tests/datasets/test_tracking_text.py` counts them). So y is to the
-left, as everywhere in this package, and nothing is mirrored unless `left_handed` is asked for.
+**Handedness.** The usual tools treat the data as left-handed (y to the right), as in OPV2V, and so does the author of
+the tracking files. The data contradict this: they were recorded in right-hand traffic (Columbus, Ohio), and in the
+tracking labels nearly all oncoming cars pass the ego car at positive y, while those overtaken or parked at the roadside
+are passed at negative y (`tests/datasets/test_tracking_text.py` counts them). So y is to the left, as everywhere in
+this package, and nothing is mirrored unless `left_handed` is set.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cobevglue.typing import Float32Array, FloatArray
 __all__ = ["LEFT_HANDED", "V2V4Real", "read_v2v4real_labels_yaml"]
 
 LEFT_HANDED = False
-"""Whether V2V4Real's y axis is to the right; the text of this module says why not. The default of all its readers."""
+"""Whether V2V4Real's y axis points to the right (see the module docstring). The default of all its readers."""
 
 
 class V2V4Real(YamlTree):
@@ -40,19 +40,19 @@ class V2V4Real(YamlTree):
     splits: ClassVar[tuple[str, ...]] = ("train", "validate", "test")
 
     def __init__(self, root: str | Path, split: str, left_handed: bool = LEFT_HANDED) -> None:
-        """Look at which scenarios there are.
+        """List the scenarios.
 
         Args:
-            root: folder that holds the splits.
+            root: folder that contains the splits.
             split: name of the split's folder.
-            left_handed: take the files as having y to the right, and mirror them (see the module's text).
+            left_handed: the y axis of the files points to the right; it is mirrored (see the module docstring).
 
         Raises:
-            FileNotFoundError: there is no such root, or the split is not in it; says what was looked for.
-            ValueError: no split is called so (names the nearest), or `left_handed` is not a bool.
+            FileNotFoundError: the root or the split does not exist; the message names the expected path.
+            ValueError: unknown split (the message suggests the most similar one), or `left_handed` is not a bool.
         """
         super().__init__(root, split)
-        if not isinstance(left_handed, bool):  # it may be what a user typed, and any text is true
+        if not isinstance(left_handed, bool):  # it may come from the command line, and any string is true
             raise ValueError(f"{type(self).__name__}: left_handed must be true or false, got {left_handed!r}")
         self.left_handed = left_handed
 
@@ -60,32 +60,32 @@ class V2V4Real(YamlTree):
         return partial(read_v2v4real_labels_yaml, agent=agent, left_handed=self.left_handed)
 
     def _read_points(self, path: Path) -> Float32Array:
-        # In `rgb` the intensity is as in OPV2V; a field `intensity` is taken as the sensor's own 0 to 255.
+        # The intensity in `rgb` is as in OPV2V; a field `intensity` is assumed to be raw, 0 to 255.
         return read_pcd(path, left_handed=self.left_handed, intensity_scale=1.0 / 255.0)
 
 
 def read_v2v4real_labels_yaml(path: Path, agent: str, left_handed: bool = LEFT_HANDED) -> tuple[FloatArray, Boxes]:
-    """Pose and objects in a yaml file of V2V4Real.
+    """Read pose and objects from a yaml file of V2V4Real.
 
     Args:
         path: the file.
         agent: name of the agent's folder, "0" or "1".
-        left_handed: the file has y to the right: mirror it.
+        left_handed: the y axis of the file points to the right; it is mirrored.
 
     Returns:
-        world_SE3_lidar (4, 4), a proper rotation, and the objects in the LiDAR frame. The id of an object is its
-        `ass_id`; one without gets a negative id from its own id and the agent, so that it never equals another's.
+        world_SE3_lidar (4, 4), and the objects in the LiDAR frame. The id of an object is its `ass_id`; objects that
+        are not associated get a unique negative id from their own id and the agent.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it is broken; names the file, the object and the field.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is malformed; the message names the file, the object and the field.
     """
     lidar_pose, table = read_objects(path, skip_kinds=("pedestrian",))
     world_SE3_lidar = rigid_SE3(lidar_pose, f"{path}: lidar_pose")
     center, yaw = table.pose[:, :3], np.deg2rad(table.pose[:, 4])
     if left_handed:
         world_SE3_lidar, center, yaw = mirrored(world_SE3_lidar), center * [1.0, -1.0, 1.0], -yaw
-    # Roll and pitch are in the LiDAR frame itself: set upright, a box keeps its yaw.
+    # Roll and pitch are relative to the LiDAR frame, so the yaw does not change when they are dropped.
     try:
         ids = _common_ids(table.ids, _associations(path, table), int(agent))
         boxes = Boxes(center=center, size=table.size, yaw=yaw, track_id=ids, label=table.kinds)
@@ -100,15 +100,15 @@ def _associations(path: Path, table: ObjectTable) -> list[int]:
         if "ass_id" not in entry:
             raise ValueError(
                 f"{path}: vehicles.{own_id} has no ass_id, the id that is common to both agents (-1: not associated); "
-                "without it an object that both observe would count as two"
+                "without it an object observed by both would be counted twice"
             )
     return [entry["ass_id"] for entry in table.entries]
 
 
 def _common_ids(own: list[int], associated: list[int], agent: int) -> list[int]:
-    """Ids that are the same for both agents where an object is associated, and unique otherwise.
+    """Ids that are the same for both agents if an object is associated, and unique otherwise.
 
-    The data set's own loader uses id + 100 x agent for the rest, which meets real ids: there are more than 100 objects.
+    The data set's own loader uses id + 100 x agent for the rest, which is not unique with more than 100 objects.
     """
     ids: list[int] = []
     for own_id, common_id in zip(own, map(int, associated), strict=True):

@@ -1,4 +1,4 @@
-"""Writes frames in V2V4Real's own layout, so that whatever reads V2V4Real reads them."""
+"""Writer of frames in V2V4Real's format."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def write_v2v4real_frame(
     speeds: Mapping[int, float] | None = None,
     left_handed: bool = LEFT_HANDED,
 ) -> None:
-    """Write what one car had at one time: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
+    """Write one frame of one car: `<timestamp>.pcd` if there is a cloud, then `<timestamp>.yaml`.
 
-    The inverse of reading: `V2V4Real` gives back pose and objects to the precision of floats, points exactly and
-    intensities to 8 bits. All objects are associated: `ass_id` is the `track_id`. The pose is dumped as a numpy array,
-    which other tools of this data set rely on. A file is there complete or not at all.
+    The inverse of `V2V4Real`, which reads pose and objects to floating-point precision, points exactly and intensities
+    to 8 bits. All objects are associated: `ass_id` is the `track_id`. The pose is dumped as a numpy array, as other
+    tools of this data set require. Files are written atomically.
 
     Args:
-        agent_folder: `<root>/<split>/<scenario>/<agent>`, the agent "0" or "1"; made if it is not there.
-        timestamp: file number as text, digits only; frames 0.1 s apart are numbered 1 apart.
+        agent_folder: `<root>/<split>/<scenario>/<agent>`, the agent "0" or "1"; created if missing.
+        timestamp: file number, digits only; frames 0.1 s apart are numbered 1 apart.
         world_SE3_lidar: (4, 4) right-handed pose of the LiDAR.
-        objects: the objects that the car could see, in its LiDAR frame, with `track_id` >= 0. Labels are kept under
-            `obj_type`, in capitals; reading makes them lower-case, and "Car" stands where there are none.
+        objects: the objects visible to the car, in its LiDAR frame, with `track_id` >= 0. Labels are stored as
+            `obj_type`, capitalised; "Car" without labels. They are read in lower case.
         points: (N, 4) x, y, z [m], intensity [0, 1] in the LiDAR frame; None to store no cloud.
-        speeds: km/h of objects by id; 0 where left out.
+        speeds: of objects by id [km/h]; 0 by default.
         left_handed: write files with y to the right, to be read with the same option.
 
     Raises:
@@ -60,7 +60,7 @@ def write_v2v4real_frame(
     """
     folder = Path(agent_folder)
     if folder.name not in AGENTS:
-        raise ValueError(f"agents of V2V4Real are called 0 and 1, got {folder.name!r}")
+        raise ValueError(f"agents of V2V4Real are named 0 and 1, got {folder.name!r}")
     check_timestamp(timestamp)
     if objects.track_id is None or (objects.track_id < 0).any():
         raise ValueError("objects must have a track_id, >= 0")
@@ -80,7 +80,7 @@ def write_v2v4real_frame(
             "speed": float((speeds or {}).get(track_id, 0.0)),
         }
     document = {"lidar_pose": pose, "true_ego_pos": pose.copy(), "vehicles": vehicles}
-    # Users of this data set have numpy 1, whose name for the helper numpy 2 knows as well.
+    # Users of this data set have numpy 1; its name of the helper is valid in numpy 2, too.
     text = yaml.dump(document, Dumper=_Dumper).replace("numpy._core.", "numpy.core.")
     if points is not None:
         write_pcd_rgb(folder / f"{timestamp}.pcd", points, left_handed=left_handed)

@@ -1,4 +1,4 @@
-"""Files that are there complete or not at all, whatever interrupts the program."""
+"""Atomic writing of files: a file exists completely or not at all, also if the program is interrupted."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["whole_file", "write_json"]
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path to write to, which takes the place of `path` when all went well; folders are made.
+    """A temporary path to write to, which replaces `path` on success; parent folders are created.
 
-    It is beside `path`, with a name that no reader of a data set looks at and that no other process writes to.
+    It is in the same folder, with a name that readers of data sets ignore and that no other process uses.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -29,7 +29,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
-    """Write a JSON file as a whole; NaN is an error."""
+    """Write a JSON file atomically; NaN is an error."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
     with whole_file(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The folder tree that OPV2V, V2XSet and V2V4Real share: split / scenario / agent / timestamp.{yaml,pcd}."""
+"""Common folder structure of OPV2V, V2XSet and V2V4Real: split / scenario / agent / timestamp.{yaml,pcd}."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ LabelReader = Callable[[Path], tuple[FloatArray, Boxes]]
 
 
 class YamlTree(Dataset):
-    """A split of a data set in OPV2V's tree. Listing it opens no file; see `OPV2V`, `V2XSet` and `V2V4Real`.
+    """A split of a data set in OPV2V's folder structure; base of `OPV2V`, `V2XSet` and `V2V4Real`.
 
     Attributes:
-        root: folder that holds the splits.
+        root: folder that contains the splits.
         split: name of the split.
     """
 
     splits: ClassVar[tuple[str, ...]] = ()
-    """The splits that the data set is published with; any other folder of this layout is taken too."""
+    """The published splits; any other folder of this structure is accepted, too."""
 
     def __init__(self, root: str | Path, split: str) -> None:
-        """Look at which scenarios there are.
+        """List the scenarios, without opening files.
 
         Args:
-            root: folder that holds the splits.
+            root: folder that contains the splits.
             split: name of the split's folder.
 
         Raises:
-            FileNotFoundError: there is no such root, or the split is not in it; says what was looked for.
-            ValueError: no split is called so; names the nearest.
+            FileNotFoundError: the root or the split does not exist; the message names the expected path.
+            ValueError: unknown split; the message suggests the most similar one.
         """
         self.root, self.split = Path(root), split
         if not self.root.is_dir():
@@ -67,11 +67,11 @@ class YamlTree(Dataset):
 
     @property
     def cloud_location(self) -> str:
-        """Where the files of the clouds are expected, for error messages."""
+        """Expected location of the clouds, for error messages."""
         return f"{self.root / self.split}/<scenario>/<agent>/<timestamp>.pcd"
 
     def _label_reader(self, agent: str) -> LabelReader:
-        """What reads a yaml file of this agent."""
+        """The reader of the yaml files of this agent."""
         raise NotImplementedError
 
     def _read_points(self, path: Path) -> Float32Array:
@@ -80,7 +80,7 @@ class YamlTree(Dataset):
     def _scenario(self, name: str) -> Scenario:
         folder = self.root / self.split / name
         listing = {agent: _timestamps(folder / agent) for agent in _subfolders(folder)}
-        # Vehicles first: the first agent is the usual choice of ego, and a roadside unit (negative id) never is.
+        # Vehicles first: the first agent is the default ego, and roadside units (negative ids) are never the ego.
         listing = {agent: listing[agent] for agent in sorted(listing, key=lambda a: (a.startswith("-"), a))}
         timestamps = sorted(set().union(*listing.values()), key=lambda stamp: (int(stamp), stamp))
         if not timestamps:
@@ -107,7 +107,7 @@ class YamlTree(Dataset):
 
 
 def check_timestamp(timestamp: str) -> None:
-    """Refuse a name that no frame can have.
+    """Validate the name of a frame.
 
     Raises:
         ValueError: it is not all digits.
@@ -117,21 +117,22 @@ def check_timestamp(timestamp: str) -> None:
 
 
 class ObjectTable:
-    """The `vehicles` of a yaml file as columns, checked.
+    """The `vehicles` of a yaml file as validated columns.
 
     Attributes:
-        ids: (N,) keys of the objects.
+        ids: (N,) ids of the objects.
         pose: (N, 6) x, y, z [m] of the box centre, roll, yaw, pitch [degrees], in the frame and axes of the file.
         size: (N, 3) length, width, height [m].
-        kinds: (N,) lower-case type; "car" where the file has none.
-        entries: (N,) the mappings themselves.
+        kinds: (N,) lower-case type; "car" if the file has none.
+        entries: (N,) the raw mappings.
     """
 
     def __init__(self, path: Path, vehicles: Any, skip_kinds: Collection[str] = ()) -> None:
-        """Objects whose box has no length or width (a simulator's two-wheelers) are left out, as are `skip_kinds`.
+        """Parse the objects without `skip_kinds` and those of zero length or width (two-wheelers of CARLA).
 
         Raises:
-            ValueError: a value is missing, not a number, not finite or a negative extent; names file, object, field.
+            ValueError: a value is missing, not a number, not finite or a negative extent; the message names file,
+                object and field.
         """
         if vehicles is not None and not isinstance(vehicles, Mapping):
             raise ValueError(f"{path}: vehicles must be a mapping from object id, got {type(vehicles).__name__}")
@@ -143,7 +144,7 @@ class ObjectTable:
             where = f"{path}: vehicles.{key}"
             if not isinstance(entry, Mapping):
                 raise ValueError(f"{where} must be a mapping, got {type(entry).__name__}")
-            # RCooper and V2X-Real, converted to this layout, call it `object_type`.
+            # The key is `object_type` in RCooper and V2X-Real, converted to this format.
             kind = str(entry.get("obj_type") or entry.get("object_type") or "car").lower()
             if kind in skip_kinds:
                 continue
@@ -155,8 +156,8 @@ class ObjectTable:
             self.ids.append(_object_id(where, key))
             self.kinds.append(kind)
             self.entries.append(entry)
-            # The offset of the box centre is added in the axes of the location, not turned with the object, as all
-            # users of these data do; in the files it hardly has a horizontal part.
+            # The offset of the box centre is added in the axes of the location, not rotated with the object, as in
+            # other readers of these data; it has almost no horizontal component.
             centre = _triple(where, entry, "location") + _triple(where, entry, "center")
             pose.append(np.concatenate([centre, _triple(where, entry, "angle")]))
             size.append(2.0 * extent)
@@ -165,11 +166,11 @@ class ObjectTable:
 
 
 def read_objects(path: Path, skip_kinds: Collection[str] = ()) -> tuple[ArrayLike, ObjectTable]:
-    """`lidar_pose` as it stands in a yaml file, and its objects.
+    """Read the raw `lidar_pose` and the objects of a yaml file.
 
     Raises:
-        FileNotFoundError: the file is not there.
-        ValueError: it is broken; names the file and the field.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is malformed; the message names the file and the field.
     """
     document = read_yaml(path, keys=("lidar_pose", "vehicles"))
     for key in ("lidar_pose", "vehicles"):
@@ -197,10 +198,10 @@ def _triple(where: str, entry: Mapping[str, Any], field: str) -> FloatArray:
 
 
 def _seconds(numbers: list[int]) -> list[float]:
-    """Seconds since the first of these file numbers, which count the ticks of a recorder that keeps 10 frames a second.
+    """Convert file numbers of a recording at 10 Hz to seconds since the first one.
 
-    OPV2V numbers by simulation ticks of 0.05 s and keeps every second one; V2V4Real counts frames. So the step is read
-    from the numbers (the most frequent one), and a missing frame stays a gap in time.
+    OPV2V numbers by simulation ticks of 0.05 s and keeps every second one; V2V4Real counts frames. The step is
+    therefore estimated as the most frequent difference, and a missing frame is a gap in time.
     """
     steps = Counter(later - earlier for earlier, later in itertools.pairwise(numbers) if later > earlier)
     step = min(steps, key=lambda value: (-steps[value], value)) if steps else 1
@@ -217,7 +218,7 @@ def _is_timestamp(stem: str) -> bool:
 
 
 def _timestamps(folder: Path) -> frozenset[str]:
-    """Names of the frames of an agent; other yaml files (`additional`, `camera_gt`) are no frames."""
+    """Names of the frames of an agent; other yaml files (`additional`, `camera_gt`) are ignored."""
     with os.scandir(folder) as entries:
         stems = (entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
         return frozenset(stem for stem in stems if _is_timestamp(stem))

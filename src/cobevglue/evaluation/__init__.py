@@ -1,1 +1,1 @@
-"""Measures of what the system finds, against the truth."""
+"""Evaluation of detections and alignments against the ground truth."""

@@ -1,7 +1,7 @@
-"""How well an aligner finds the relative pose, frame by frame, by how many objects both agents detected.
+"""Evaluation of aligners: pose errors by frame, by number of co-visible objects.
 
-*Landing error*: how far other's boxes lie from where the true pose puts them, on average over the boxes [m]. It is what
-a user of the pose notices, and unlike the error of the translation it does not depend on where the frames' origins are.
+*Landing error*: mean distance between other's boxes transformed by the estimated and by the true pose [m]. It measures
+the effect on a user of the pose and, unlike the translation error, does not depend on the origins of the frames.
 
 *Right*: accepted with a landing error below 3 m. *Wrong*: accepted but not right. *Success at k*: accepted with a
 translation error below k m and a yaw error below k degrees. A refusal is neither right nor wrong.
@@ -38,22 +38,22 @@ RIGHT = 3.0
 """Landing error of a right pose [m]."""
 
 _GROUPS = {"all": (0, None), "0": (0, 0), "1": (1, 1), "2": (2, 2), "3": (3, 3), ">= 2": (2, None), ">= 4": (4, None)}
-"""Numbers of co-visible objects that are reported apart: first and last."""
+"""Groups of frames by number of co-visible objects: first and last."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairFrame:
-    """What two agents saw at one time, and the truth about it.
+    """Tracked boxes of two agents in one frame, and the ground truth.
 
     Attributes:
         ego: tracked boxes in ego's frame.
         other: tracked boxes in other's frame.
         ego_SE2_other: the true relative pose.
-        co_visible: how many objects both detected.
-        pairs: (K, 2) rows of ego and other that are one object, or None where this is not known.
-        ego_body: one-row box of the ego's own vehicle in the ego frame, if it is given to the aligner.
+        co_visible: number of objects that both detected.
+        pairs: (K, 2) rows of ego and other that are the same object; None if unknown.
+        ego_body: one-row box of the ego's own vehicle in the ego frame, or None.
         other_body: likewise of the other agent, in its own frame.
-        time: of the frame [s]; None for 0.1 s after the last.
+        time: of the frame [s]; None for 0.1 s after the previous one.
     """
 
     ego: Boxes
@@ -76,7 +76,7 @@ class AlignmentSequence:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What an aligner did in one frame. Errors are infinite where it refused; `seconds` is the call's duration."""
+    """Result of an aligner in one frame. Errors are infinite if it refused; `seconds` is the duration of the call."""
 
     sequence: str
     co_visible: int
@@ -91,17 +91,17 @@ class Record:
 
     @property
     def right(self) -> bool:
-        """Accepted, and other's boxes land within 3 m on average of where they should."""
+        """Whether the alignment was accepted with a landing error below 3 m."""
         return self.accepted and self.landing_error < RIGHT
 
     def success(self, k: float) -> bool:
-        """Accepted, within k metres and k degrees."""
+        """Whether the alignment was accepted with errors below k metres and k degrees."""
         return self.accepted and self.translation_error < k and self.yaw_error < math.radians(k)
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Shares over a set of frames; NaN where there are none to divide by."""
+    """Fractions over a set of frames; NaN where the denominator is 0."""
 
     frames: int
     right: float
@@ -116,14 +116,14 @@ class Summary:
 
 
 def landing_error(estimate: SE2, truth: SE2, other: Boxes) -> float:
-    """Mean distance between other's boxes placed by two poses [m]; at its origin when it has no boxes."""
+    """Mean distance between other's box centres transformed by two poses [m]; without boxes, that of its origin."""
     points = other.center[:, :2] if len(other) else np.zeros((1, 2))
     gap = estimate.apply(points) - truth.apply(points)
     return float(np.hypot(gap[:, 0], gap[:, 1]).mean())
 
 
 def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], Aligner]) -> Iterator[Record]:
-    """Run a fresh aligner over every sequence, in order."""
+    """Run a new aligner on each sequence, in order."""
     for sequence in sequences:
         aligner = make_aligner()
         for frame in sequence.frames:
@@ -151,7 +151,7 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
 
 
 def _count_matches(found: IntArray, pairs: IntArray | None) -> tuple[int, int]:
-    """How many of the found matches are true, and how many true ones there are."""
+    """Number of correct matches among `found`, and number of true matches."""
     if pairs is None:
         return 0, 0
     truth = set(map(tuple, pairs.tolist()))
@@ -159,11 +159,11 @@ def _count_matches(found: IntArray, pairs: IntArray | None) -> tuple[int, int]:
 
 
 def summarise(records: Iterable[Record], wrong: Callable[[Record], bool] = lambda r: not r.right) -> Summary:
-    """Shares over these frames.
+    """Compute the fractions over a set of frames.
 
     Args:
-        records: of the frames to count.
-        wrong: what makes an accepted alignment a wrong one; by default a landing error of 3 m or more.
+        records: of the frames.
+        wrong: predicate of wrong alignments among the accepted ones; by default a landing error of 3 m or more.
     """
     rows = list(records)
     accepted = [r for r in rows if r.accepted]
@@ -188,14 +188,14 @@ def summarise(records: Iterable[Record], wrong: Callable[[Record], bool] = lambd
 
 
 def off_by_3(record: Record) -> bool:
-    """The stricter meaning of wrong, for exact ground truth: beyond 3 m or 3 degrees."""
+    """Whether an error exceeds 3 m or 3 degrees: the stricter criterion of wrong, for exact ground truth."""
     return not record.success(3.0)
 
 
 def by_co_visible(
     records: Sequence[Record], wrong: Callable[[Record], bool] = lambda r: not r.right
 ) -> dict[str, Summary]:
-    """A summary for each group of frames by their number of co-visible objects; groups without frames are left out."""
+    """Summarise frames by number of co-visible objects; groups without frames are omitted."""
     groups = {}
     for name, (first, last) in _GROUPS.items():
         part = [r for r in records if r.co_visible >= first and (last is None or r.co_visible <= last)]

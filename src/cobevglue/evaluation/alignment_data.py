@@ -1,7 +1,7 @@
-"""Sequences to measure aligners on: from recorded detections, from noisy labels, or from clouds through a detector.
+"""Sequences to evaluate aligners on: from recorded detections, from noisy labels, or from clouds through a detector.
 
-The identity that V2V4Real's detection files store (both cars' boxes already in ego's frame) never reaches an aligner:
-other's boxes are moved into a frame that drives smoothly through the scene before anything sees them.
+V2V4Real's detection files store the boxes of both cars in ego's frame. Other's boxes are therefore transformed into a
+frame with a smooth trajectory before they are tracked and aligned.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ __all__ = [
     "Perceiver",
     "noisy_label_sequences",
     "perceived_sequences",
-    "smooth_drive",
+    "smooth_trajectory",
     "v2v4real_car_sequences",
     "v2v4real_sequences",
 ]
 
 V2V4REAL_TRAIN = tuple(f"train/{i:04d}" for i in range(11))
-"""Detection sequences the defaults were tuned on."""
+"""Detection sequences that the defaults were tuned on."""
 V2V4REAL_VAL = ("val/0001", "val/0004", "val/0005", "val/0008")
-"""Detection sequences that took no part in the numeric search; val/0000 is train/0000 again and is left out."""
+"""Detection sequences that were not used in the numeric search, without val/0000, a duplicate of train/0000."""
 
 _FRAME = 0.1
 _DETECTED_WITHIN, _DETECTED_TURN = 2.5, math.radians(30.0)
-"""A detection is of a labelled object when this close [m] and, modulo pi, this well turned [rad]."""
+"""Maximum distance [m] and heading difference modulo pi [rad] of a detection from its labelled object."""
 _DETECTED_IOU = 0.1
-"""A detection is of an exactly known object when they overlap by more."""
-_DRIVE_STREAM, _ERROR_STREAM = 0, 1
+"""Minimum bird's-eye-view IoU (exclusive) of a detection and its object, where the labels are exact."""
+_TRAJECTORY_STREAM, _ERROR_STREAM = 0, 1
 _FALSE = np.iinfo(np.int64).min
 """Object id of a false box; no data set uses it."""
 
 
-def smooth_drive(seed: int, frames: int) -> list[SE2]:
-    """A frame that drives through the scene as a car would: poses in the scene, 0.1 s apart.
+def smooth_trajectory(seed: int, frames: int) -> list[SE2]:
+    """A smooth random trajectory of a car: poses in the scene, 0.1 s apart.
 
-    Up to 15 m/s and 0.15 rad/s, both changing slowly, from a random place and heading within 40 m of the origin.
+    Up to 15 m/s and 0.15 rad/s, both changing slowly, from a random position within 40 m of the origin on each axis.
     """
-    rng = np.random.default_rng([seed, _DRIVE_STREAM])
+    rng = np.random.default_rng([seed, _TRAJECTORY_STREAM])
     x, y = rng.uniform(-40.0, 40.0, 2)
     pose = SE2(x, y, rng.uniform(-math.pi, math.pi))
     speed, turn = rng.uniform(-12.0, 12.0), rng.uniform(-0.15, 0.15)
@@ -80,8 +80,8 @@ def v2v4real_sequences(
     Args:
         root: folder with `train` and `val`, as `shared/data/v2v4real_detections`.
         names: such as "val/0004".
-        seed: of the drive that other's frame is moved along.
-        min_score: detections below it are dropped before tracking.
+        seed: of the trajectory of other's frame.
+        min_score: detections with lower scores are dropped before tracking.
     """
     return [_v2v4real_sequence(root, name, seed, min_score) for name in names]
 
@@ -92,11 +92,11 @@ def _v2v4real_sequence(root: Path, name: str, seed: int, min_score: float) -> Al
     n = count_frames(*files)
     ego_boxes, other_boxes = (read_v2v4real_detections(file, n) for file in files[:2])
     labels = read_v2v4real_labels(files[2], n)
-    drive = smooth_drive(seed * 1000 + int(number) + 100 * (split == "val"), n)
+    trajectory = smooth_trajectory(seed * 1000 + int(number) + 100 * (split == "val"), n)
     ego_tracker, other_tracker = Sort(), Sort()
     frames = []
-    for ego, other, label, ego_SE2_other in zip(ego_boxes, other_boxes, labels, drive, strict=True):
-        ego, other = _above(ego, min_score), _above(other, min_score)
+    for ego, other, label, ego_SE2_other in zip(ego_boxes, other_boxes, labels, trajectory, strict=True):
+        ego, other = _filter_by_score(ego, min_score), _filter_by_score(other, min_score)
         both = set(_detected(label, ego)) & set(_detected(label, other))
         moved = other.transform(ego_SE2_other.inverse())
         frames.append(PairFrame(ego_tracker.update(ego), other_tracker.update(moved), ego_SE2_other, len(both)))
@@ -106,14 +106,14 @@ def _v2v4real_sequence(root: Path, name: str, seed: int, min_score: float) -> Al
 def v2v4real_car_sequences(root: Path, cars: Path, names: tuple[str, ...], bodies: bool) -> list[AlignmentSequence]:
     """Recorded detections of two real cars, each list in its own car's frame.
 
-    The other car's frame is its label's: origin at the box centre, x along the heading. Frames in which the other car
-    is not labelled are left out, since its pose is not known there; so are sequences in which it never is.
+    The other car's frame is that of its label: origin at the box centre, x along the heading. Frames without a label
+    of the other car are omitted, since its pose is unknown, and so are sequences without any.
 
     Args:
         root: folder with `train` and `val`, as `shared/data/v2v4real_detections`.
         cars: table of the labels that are the two cars, as `shared/data/v2v4real_cars.csv`.
         names: such as "val/0004".
-        bodies: give each agent's own vehicle to the aligner. The ego's is the median of its labels.
+        bodies: pass each agent's own vehicle to the aligner. The ego's is the median of its labels.
     """
     with cars.open(newline="") as file:
         ids = {
@@ -154,26 +154,26 @@ def _v2v4real_car_sequence(root: Path, name: str, other_id: int, ego_id: int | N
 
 
 def _with_id(labels: Boxes, track_id: int | None) -> Boxes:
-    """The row of this id, or none."""
+    """The row with this id, or no rows."""
     if track_id is None or labels.track_id is None:
         return labels[:0]
     return labels[labels.track_id == track_id]
 
 
 def _median_box(boxes: Iterable[Boxes]) -> Boxes:
-    """The median box of one vehicle; a car at the origin where there is none."""
+    """The median box of one vehicle; a default car at the origin without boxes."""
     rows = Boxes.concatenate([part.replace(track_id=None) for part in boxes])
     if not len(rows):
         return Boxes([(0.0, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
     return Boxes(np.median(rows.center, axis=0)[None], np.median(rows.size, axis=0)[None], [np.median(rows.yaw)])
 
 
-def _above(boxes: Boxes, min_score: float) -> Boxes:
+def _filter_by_score(boxes: Boxes, min_score: float) -> Boxes:
     return boxes if boxes.score is None or min_score <= 0.0 else boxes[boxes.score >= min_score]
 
 
 def _detected(labels: Boxes, detections: Boxes) -> IntArray:
-    """Rows of the labels that have a detection of their own within 2.5 m, heading modulo pi."""
+    """Rows of the labels that are matched one-to-one to a detection, by distance and heading modulo pi."""
     gap = np.linalg.norm(labels.center[:, None, :2] - detections.center[None, :, :2], axis=-1)
     turn = np.abs((labels.yaw[:, None] - detections.yaw[None, :] + math.pi / 2) % math.pi - math.pi / 2)
     cost = np.where((gap < _DETECTED_WITHIN) & (turn < _DETECTED_TURN), gap, 1e3)
@@ -185,24 +185,25 @@ def _detected(labels: Boxes, detections: Boxes) -> IntArray:
 def noisy_label_sequences(
     dataset: Dataset, errors: DetectionErrors, seed: int = 0, max_range: float = math.inf
 ) -> Iterator[AlignmentSequence]:
-    """Every pair of agents of every scenario, with a detector's errors added to the labels and tracks on top.
+    """Sequences of every pair of agents of every scenario: labels with detection errors, tracked.
 
     Args:
-        dataset: one whose object ids are the same for all agents (OPV2V, V2XSet).
-        errors: what the detectors do wrong.
+        dataset: its object ids are the same for all agents (OPV2V, V2XSet).
+        errors: model of the detection errors.
         seed: of the errors.
         max_range: objects farther from an agent are not detected [m].
     """
     for index, scenario in enumerate(dataset):
         names = sorted({name for frame in scenario for name in frame.agents})
-        seen = [
+        detected = [
             _detect(scenario, name, errors, [seed, _ERROR_STREAM, index, j], max_range) for j, name in enumerate(names)
         ]
         for a, b in itertools.combinations(range(len(names)), 2):
             frames = []
             for i, frame in enumerate(scenario):
-                if i in seen[a] and i in seen[b]:
-                    frames.append(_pair_frame(seen[a][i], frame.agents[names[a]], seen[b][i], frame.agents[names[b]]))
+                if i in detected[a] and i in detected[b]:
+                    ego, other = frame.agents[names[a]], frame.agents[names[b]]
+                    frames.append(_pair_frame(detected[a][i], ego, detected[b][i], other))
             yield AlignmentSequence(f"{scenario.name}/{names[a]}-{names[b]}", frames)
 
 
@@ -210,26 +211,26 @@ def _detect(
     scenario: Scenario, name: str, errors: DetectionErrors, key: list[int], max_range: float
 ) -> dict[int, tuple[Boxes, IntArray]]:
     """Tracked noisy boxes of one agent and their true object ids (`_FALSE` for false boxes), by frame number."""
-    tracker, seen = Sort(), {}
+    tracker, detected = Sort(), {}
     for i, frame in enumerate(scenario):
         if name not in frame.agents:
             continue
         objects = frame.agents[name].objects
         objects = objects[np.hypot(objects.center[:, 0], objects.center[:, 1]) < max_range]
         if objects.track_id is None and len(objects):
-            raise ValueError(f"{scenario.name}: {name}: objects have no ids, so what both agents see is not known")
+            raise ValueError(f"{scenario.name}: {name}: objects have no ids, so co-visible objects are unknown")
         boxes, rows = add_detection_errors(objects, errors, np.random.default_rng([*key, i]))
         ids = np.full(len(rows), _FALSE)
         if objects.track_id is not None:
             ids[rows >= 0] = objects.track_id[rows[rows >= 0]]
-        seen[i] = tracker.update(boxes), ids
-    return seen
+        detected[i] = tracker.update(boxes), ids
+    return detected
 
 
 def _pair_frame(
     ego: tuple[Boxes, IntArray], ego_agent: AgentFrame, other: tuple[Boxes, IntArray], other_agent: AgentFrame
 ) -> PairFrame:
-    """What two agents detected, each with the true object ids of its boxes (`_FALSE` for false ones), and the truth."""
+    """A frame from the boxes of two agents, each with the true object ids of its boxes (`_FALSE` for false ones)."""
     (ego_boxes, ego_ids), (other_boxes, other_ids) = ego, other
     truth = SE2.from_matrix(np.linalg.inv(ego_agent.world_SE3_lidar) @ other_agent.world_SE3_lidar)
     pairs = np.argwhere((ego_ids[:, None] == other_ids[None, :]) & (ego_ids[:, None] != _FALSE))
@@ -237,7 +238,7 @@ def _pair_frame(
 
 
 class Perceived(Protocol):
-    """What one agent made of a cloud, such as `PerceptionOutput`."""
+    """Perception output of one agent, such as `PerceptionOutput`."""
 
     @property
     def boxes(self) -> Boxes:
@@ -249,41 +250,41 @@ class Perceiver(Protocol):
     """Detector and tracker of one agent, such as `Perception`."""
 
     def step(self, points: Float32Array, /) -> Perceived:
-        """The agent's next cloud (N, 4)."""
+        """Process the agent's next cloud (N, 4)."""
         ...
 
 
 def perceived_sequences(
     scenarios: Iterable[Scenario], make_perceiver: Callable[[], Perceiver]
 ) -> Iterator[AlignmentSequence]:
-    """Every pair of agents of every scenario, each agent's boxes detected in its own clouds and tracked.
+    """Sequences of every pair of agents of every scenario: boxes detected in each agent's own clouds and tracked.
 
-    Frames in which one of the two has no cloud are left out.
+    Frames in which one of the two has no cloud are omitted.
 
     Args:
         scenarios: with clouds, exact poses and object ids.
-        make_perceiver: makes a new detector and tracker for an agent; called once for each.
+        make_perceiver: creates the detector and tracker of an agent; called once for each.
     """
     for scenario in scenarios:
         names = sorted({name for frame in scenario for name in frame.agents})
         perceivers = {name: make_perceiver() for name in names}
         frames: dict[tuple[str, str], list[PairFrame]] = {pair: [] for pair in itertools.combinations(names, 2)}
         for frame in scenario:
-            seen = {
+            perceived = {
                 name: (_with_ids(perceivers[name].step(agent.points).boxes, agent.objects), agent)
                 for name, agent in frame.agents.items()
                 if agent.points is not None
             }
             for (ego, other), pair_frames in frames.items():
-                if ego in seen and other in seen:
-                    pair_frames.append(_pair_frame(*seen[ego], *seen[other]))
+                if ego in perceived and other in perceived:
+                    pair_frames.append(_pair_frame(*perceived[ego], *perceived[other]))
         for (ego, other), pair_frames in frames.items():
             if pair_frames:
                 yield AlignmentSequence(f"{scenario.name}/{ego}-{other}", pair_frames)
 
 
 def _with_ids(detections: Boxes, objects: Boxes) -> tuple[Boxes, IntArray]:
-    """The detections, and the id of the object that each is of: one-to-one, those that overlap most first."""
+    """The detections, and the object id of each (`_FALSE` without one): the one-to-one assignment of largest IoU."""
     assert objects.track_id is not None
     iou = bev_iou(detections, objects)
     rows, columns = linear_sum_assignment(-iou)

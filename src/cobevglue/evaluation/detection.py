@@ -1,21 +1,21 @@
-"""How well a detector finds objects: average precision, and what is wrong with the boxes it finds.
+"""Evaluation of detections: average precision, and errors of the true positives.
 
-Which detections are true, false or dropped is decided frame by frame, as `detection_matching` says.
+Detections are matched to objects frame by frame and are then true, false or dropped; see `detection_matching`.
 
-*Precision* is the share of true ones among the detections of at least some score, *recall* the share of counted objects
-that they found. Going through the detections in some order gives a precision and a recall after each of them. *Average
-precision* (AP) is the area under the curve of precision over recall, where precision is first replaced by the highest
-one at this or any greater recall (all points, as in VOC 2010). Without any object to find it is NaN.
+*Precision* is the fraction of true ones among the detections above some score, *recall* the fraction of evaluated
+objects that are matched to them. Each prefix of the ordered detections has a precision and a recall. *Average
+precision* (AP) is the area under the curve of precision over recall, where precision is first replaced by the maximum
+at this or any greater recall (all points, as in VOC 2010). Without evaluated objects it is NaN.
 
-The order is where two dialects differ, and with it AP, by 10 to 20 points on the same boxes:
+Two dialects differ in the order of the detections, and in AP by 10 to 20 points on the same boxes:
 
-- `"global"`: all detections of the split by falling score. It is what VOC, KITTI and nuScenes mean by AP, and ours.
-- `"frame-order"`: frame after frame as they come, by falling score only within a frame, which is what the released
-  code of OpenCOOD and V2V4Real computes. A poor detection of the first frame then comes before the best of the second,
-  and AP changes with the order of the frames. Only for comparison with numbers published that way.
+- `"global"`: all detections of the split by descending score, as in VOC, KITTI and nuScenes. The default.
+- `"frame-order"`: frames in their given order, detections by descending score only within a frame, as in the released
+  code of OpenCOOD and V2V4Real. The worst detection of the first frame then precedes the best of the second, and AP
+  depends on the order of the frames. Only for comparison with numbers published that way.
 
-*Range bins* [a, b) go by the distance between agent and box centre, seen from above. An object counts in the bin of its
-own distance, a true detection in that of its object, and a false one in that of its own distance.
+*Range bins* [a, b) refer to the horizontal distance between agent and box centre. Objects and false detections belong
+to the bin of their own distance, true detections to that of their object.
 """
 
 from __future__ import annotations
@@ -55,21 +55,21 @@ __all__ = [
 DIALECTS = ("global", "frame-order")
 THRESHOLDS = (0.3, 0.5, 0.7)
 RANGE_BINS = ((0.0, 30.0), (30.0, 50.0), (50.0, 100.0), (100.0, math.inf))
-"""Those of V2V4Real and DAIR-V2X [m], and what is beyond."""
+"""Those of V2V4Real and DAIR-V2X, and everything beyond [m]."""
 
 _ERRORS_AT = 0.5
-"""IoU from which a detection's errors are looked at."""
+"""IoU threshold of the detections whose errors are evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThresholdScore:
-    """Objects and detections at one IoU threshold; shares in [0, 1], NaN where there is nothing to divide by.
+    """Scores at one IoU threshold; fractions in [0, 1], NaN where the denominator is 0.
 
     Attributes:
         ap: average precision by dialect.
-        detections: true and false ones, of any score.
-        recall: share of objects found by detections of at least the report's score threshold.
-        precision: share of true ones among these detections.
+        detections: number of true and false detections of any score.
+        recall: fraction of objects matched to detections of at least the report's score threshold.
+        precision: fraction of true ones among these detections.
     """
 
     ap: dict[str, float]
@@ -80,7 +80,7 @@ class ThresholdScore:
 
 @dataclass(frozen=True, slots=True)
 class GroupScore:
-    """All objects, or those of a range bin: how many count, and the scores by IoU threshold."""
+    """Number of evaluated objects, in total or of a range bin, and scores by IoU threshold."""
 
     truth: int
     at: dict[float, ThresholdScore]
@@ -88,20 +88,20 @@ class GroupScore:
 
 @dataclass(frozen=True, slots=True)
 class BoxErrors:
-    """Of the true detections at IoU 0.5 of at least the report's score threshold; medians, NaN without any.
+    """Median errors of the true detections at IoU 0.5 and the report's score threshold; NaN without any.
 
     Signed errors are detection minus truth. Lengths are in metres, angles in radians.
 
     Attributes:
-        count: how many there are.
-        flipped: share whose heading is off by more than a quarter turn.
-        distance: between the centres, seen from above.
-        distance_90: the same, nine in ten are better.
-        longitudinal: signed, along the object's true heading; -0.2 is a box that sits 0.2 m too far back.
+        count: number of these detections.
+        flipped: fraction with a heading error above 90 degrees.
+        distance: horizontal distance of the centres.
+        distance_90: its 90th percentile.
+        longitudinal: signed, along the object's true heading; -0.2 is a box 0.2 m too far back.
         lateral: signed, to the object's left.
         radial: signed, along the line of sight from the agent; positive is too far away.
         vertical: signed, upwards.
-        yaw: magnitude, modulo half a turn, as flips are counted apart.
+        yaw: magnitude, modulo 180 degrees, as flips are counted separately.
         length, width, height: signed.
     """
 
@@ -121,7 +121,7 @@ class BoxErrors:
 
 @dataclass(frozen=True, slots=True)
 class LabelRecall:
-    """How many objects of one label count, and the share found at IoU 0.5 and the report's score threshold."""
+    """Number of evaluated objects of one label, and their recall at IoU 0.5 and the report's score threshold."""
 
     truth: int
     recall: float
@@ -129,19 +129,19 @@ class LabelRecall:
 
 @dataclass(frozen=True, slots=True)
 class DetectionReport:
-    """Everything about a split; `dataclasses.asdict` is ready for JSON but for NaN.
+    """Results of a split; `dataclasses.asdict` gives JSON values, except for NaN.
 
     Attributes:
-        frames: how many there were.
-        evaluation_range: x_min, x_max, y_min, y_max [m], None for everywhere.
+        frames: number of frames.
+        evaluation_range: x_min, x_max, y_min, y_max [m], None for unlimited.
         min_points: objects with fewer points were ignored.
-        score_threshold: least score of the detections behind recall, precision, errors and labels (not AP).
-        ignored_truth: how many objects were ignored.
-        detections_outside: how many detections lay outside the range.
-        overall: all objects.
-        by_range: objects by distance, by the name of the bin.
-        errors: of the boxes found.
-        labels: recall by label, empty where the truth has none.
+        score_threshold: minimum score of the detections in recall, precision, errors and labels (not AP).
+        ignored_truth: number of ignored objects.
+        detections_outside: number of detections outside the range.
+        overall: scores of all objects.
+        by_range: scores by name of the range bin.
+        errors: of the true detections.
+        labels: recall by label, empty if the truth has none.
     """
 
     frames: int
@@ -156,7 +156,7 @@ class DetectionReport:
     labels: dict[str, LabelRecall]
 
     def ap(self, threshold: float, dialect: str = "global") -> float:
-        """Average precision of all objects at one of the IoU thresholds, in [0, 1]."""
+        """Average precision over all objects at one of the IoU thresholds, in [0, 1]."""
         return self.overall.at[threshold].ap[dialect]
 
 
@@ -164,8 +164,8 @@ def average_precision(true: BoolArray, truth_count: int) -> float:
     """Area under the precision-recall curve, all points.
 
     Args:
-        true: (N,) whether a detection is true, in the order that the curve goes through them.
-        truth_count: how many objects there are to find.
+        true: (N,) whether each detection is true, in the order of the curve.
+        truth_count: number of evaluated objects.
 
     Returns:
         In [0, 1]; NaN if there are no objects.
@@ -185,18 +185,19 @@ def evaluate_detections(
     range_bins: Sequence[tuple[float, float]] = RANGE_BINS,
     score_threshold: float = 0.3,
 ) -> DetectionReport:
-    """Compare detections with the truth, over all frames together. Frames are used once and not kept.
+    """Evaluate detections over all frames together. Frames are iterated once and not kept.
 
     Args:
-        frames: in the order that the "frame-order" dialect goes through them.
-        thresholds: IoU from which a detection is true, in (0, 1].
-        evaluation_range: what lies outside is ignored (truth) or left out (detections); None for everywhere.
-        min_points: objects with fewer points in them are ignored; 0 counts those that no point hit, too.
-        range_bins: [first, last) distances that are reported apart [m].
-        score_threshold: least score of the detections behind recall, precision, errors and labels; AP uses all.
+        frames: in the order of the "frame-order" dialect.
+        thresholds: minimum IoU of true detections, in (0, 1].
+        evaluation_range: boxes outside are ignored (truth) or discarded (detections); None for unlimited.
+        min_points: objects with fewer points are ignored; 0 also evaluates objects without points.
+        range_bins: [first, last) distances with scores of their own [m].
+        score_threshold: minimum score of the detections in recall, precision, errors and labels; AP uses all.
 
     Raises:
-        ValueError: no or bad thresholds, a frame without what is needed, or an empty range.
+        ValueError: no or invalid thresholds, a frame without point counts where `min_points` needs them, or an empty
+            range.
     """
     if not thresholds or not all(0.0 < t <= 1.0 for t in thresholds):
         raise ValueError(f"thresholds must be in (0, 1], got {tuple(thresholds)}")
@@ -220,7 +221,7 @@ def evaluate_detections(
 
 @dataclass(slots=True)
 class _Curve:
-    """What counts for AP at one IoU threshold, frame by frame, best detections first: (N,) each."""
+    """The detections at one IoU threshold by frame, descending scores: (N,) arrays."""
 
     score: list[FloatArray] = field(default_factory=list)
     true: list[BoolArray] = field(default_factory=list)
@@ -237,7 +238,7 @@ class _Curve:
 
 @dataclass(slots=True)
 class _Tally:
-    """What is kept of the frames."""
+    """Accumulator of the frames."""
 
     curves: dict[float, _Curve]
     score_threshold: float
@@ -269,28 +270,28 @@ class _Tally:
 def _score(
     curves: dict[float, _Curve], truth_distance: FloatArray, first: float, last: float, score_threshold: float
 ) -> GroupScore:
-    """The scores of what is at distances in [first, last)."""
+    """Scores of objects and detections at distances in [first, last)."""
     truth = int(((first <= truth_distance) & (truth_distance < last)).sum())
     at = {}
     for threshold, curve in curves.items():
         distance = _joined(curve.distance)
         group = (first <= distance) & (distance < last)
         score, true = _joined(curve.score)[group], _joined(curve.true).astype(np.bool_)[group]
-        sure = score >= score_threshold
+        confident = score >= score_threshold
         at[threshold] = ThresholdScore(
             ap={
                 "global": average_precision(true[np.argsort(-score, kind="stable")], truth),
                 "frame-order": average_precision(true, truth),
             },
             detections=len(true),
-            recall=_share(int(true[sure].sum()), truth),
-            precision=_share(int(true[sure].sum()), int(sure.sum())),
+            recall=_share(int(true[confident].sum()), truth),
+            precision=_share(int(true[confident].sum()), int(confident.sum())),
         )
     return GroupScore(truth, at)
 
 
 def _box_errors(detections: Boxes, truth: Boxes) -> BoxErrors:
-    """Errors of detections, row by row against the object that each of them found."""
+    """Errors of detections against their matched objects, row by row."""
     gap = detections.center - truth.center
     c, s = np.cos(truth.yaw), np.sin(truth.yaw)
     turn = np.abs(np.arctan2(np.sin(detections.yaw - truth.yaw), np.cos(detections.yaw - truth.yaw)))
@@ -314,7 +315,7 @@ def _box_errors(detections: Boxes, truth: Boxes) -> BoxErrors:
 
 
 def _distance(boxes: Boxes) -> FloatArray:
-    """(N,) of the centres from the origin, seen from above [m]."""
+    """(N,) horizontal distance of the centres from the origin [m]."""
     distance: FloatArray = np.hypot(boxes.center[:, 0], boxes.center[:, 1])
     return distance
 

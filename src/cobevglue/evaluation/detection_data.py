@@ -1,4 +1,4 @@
-"""Clouds with their truth, to measure a detector on: every agent's own cloud of a data set, or simulated ones."""
+"""Labelled clouds to evaluate a detector on: the clouds of all agents of a data set, or simulated ones."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ __all__ = ["Cloud", "Detector", "Episodes", "dataset_clouds", "detect", "simulat
 
 
 class Detector(Protocol):
-    """What finds boxes in a cloud, such as `PointPillars`."""
+    """Interface of detectors, such as `PointPillars`."""
 
     def detect(self, points: Float32Array, /) -> Boxes:
-        """Boxes with scores in the frame of the points (N, 4)."""
+        """Detect boxes with scores, in the frame of the points (N, 4)."""
         ...
 
 
 class Episodes(Protocol):
-    """A source of clouds without end, such as `SimulatedEpisodes`."""
+    """An infinite source of labelled clouds, such as `SimulatedEpisodes`."""
 
     def episode(self, index: int) -> Sequence[LabelledCloud]:
         """The clouds of episode `index`, from 0."""
@@ -35,15 +35,15 @@ class Episodes(Protocol):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cloud:
-    """One agent's cloud at one time, and the objects that this agent could see, in its LiDAR frame.
+    """The cloud and labels of one agent in one frame, in its LiDAR frame.
 
     Attributes:
-        frame: name of the frame, with that of its scenario.
+        frame: names of scenario and frame.
         agent: name of the agent.
-        points: (N, 4) x, y, z [m], intensity; None where no cloud is stored, or no labels for it.
-        truth: K boxes; none where `points` is None.
-        point_count: (K,) points in each of them.
-        missing_labels: where a file of the labels or of their calibration is not there, the error that names it.
+        points: (N, 4) x, y, z [m], intensity; None if the cloud or its labels are missing.
+        truth: K boxes; none if `points` is None.
+        point_count: (K,) number of points in each box.
+        missing_labels: error message that names the missing label or calibration file, if any.
     """
 
     frame: str
@@ -55,26 +55,26 @@ class Cloud:
 
 
 def dataset_clouds(scenarios: Iterable[Scenario]) -> Iterator[Cloud]:
-    """Every agent of every frame, in order, with its own labels; also those without a cloud or labels, to be counted.
+    """The clouds of every agent of every frame, in order, with its own labels; missing ones are included.
 
     Args:
         scenarios: a split of a data set, or some of its scenarios.
 
     Raises:
-        ValueError: a broken file; names it.
+        ValueError: a malformed file; the message names it.
     """
     for scenario in scenarios:
         for frame in scenario:
             for name, agent in frame.agents.items():
                 points, where = agent.points, f"{frame.scenario}/{frame.timestamp}"
-                nothing = Cloud(where, name, None, Boxes.empty(), np.zeros(0, dtype=np.int64))
+                missing = Cloud(where, name, None, Boxes.empty(), np.zeros(0, dtype=np.int64))
                 if points is None:
-                    yield nothing
+                    yield missing
                     continue
                 try:
                     objects = agent.objects
                 except FileNotFoundError as error:
-                    yield replace(nothing, missing_labels=str(error))
+                    yield replace(missing, missing_labels=str(error))
                 else:
                     yield Cloud(where, name, points, objects, count_points(points, objects))
 
@@ -90,13 +90,13 @@ def simulated_clouds(source: Episodes, count: int) -> Iterator[Cloud]:
 
 
 def detect(cloud: Cloud, detector: Detector) -> DetectionFrame:
-    """What the detector finds in a cloud, next to the truth.
+    """Run the detector on a cloud and combine the detections with the ground truth.
 
     Raises:
         ValueError: the frame has no cloud or no labels.
     """
     if cloud.points is None:
         raise ValueError(f"{cloud.frame}: {cloud.agent}: {cloud.missing_labels or 'no cloud is stored'}")
-    found = detector.detect(cloud.points)
-    counts = count_points(cloud.points, found)
-    return DetectionFrame(found, cloud.truth, cloud.point_count, cloud.frame, cloud.agent, counts)
+    detections = detector.detect(cloud.points)
+    counts = count_points(cloud.points, detections)
+    return DetectionFrame(detections, cloud.truth, cloud.point_count, cloud.frame, cloud.agent, counts)

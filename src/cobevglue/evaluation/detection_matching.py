@@ -4,11 +4,11 @@
 `min_points` points. All others are *ignored*: detecting them is neither required nor an error. With `min_points=0`
 objects without points are evaluated, too. Detections whose centre is outside the range are discarded.
 
-*Matching*, one IoU threshold at a time: in falling order of score (equal scores in order of their rows), each detection
-takes the counted object it overlaps most among those not yet taken. It is *true* if that overlap (bird's-eye-view IoU)
-is at least the threshold; otherwise the object stays free for others. A detection that is not true but overlaps an
-ignored object by the threshold or more is *dropped*, as if it were not there; an ignored object can drop any number of
-them. What remains is *false*. A second detection of a counted object is therefore false.
+*Matching*, for each IoU threshold: in descending order of score (equal scores in order of their rows), each detection
+is assigned to the evaluated object of largest bird's-eye-view IoU among those not yet matched. It is *true* if the IoU
+is at least the threshold; otherwise the object stays unmatched. A detection that is not true but overlaps an ignored
+object by the threshold or more is *dropped*; an ignored object can drop any number of them. All others are *false*. A
+second detection of an evaluated object is therefore false.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ class DetectionFrame:
     Attributes:
         detections: N boxes with scores.
         truth: K boxes; results are also reported by label, where there are labels.
-        point_count: (K,) how many points of the cloud lie in each object, or None where this is not known.
+        point_count: (K,) number of points of the cloud in each object; None if unknown.
         name: of the frame, for lists of failures and error messages.
-        agent: whose frame it is, for the same.
-        detection_point_count: (N,) how many points lie in each detection, or None.
+        agent: name of the agent, for the same.
+        detection_point_count: (N,) number of points in each detection, or None.
 
     Raises:
-        ValueError: detections without scores, or counts that do not fit; names the frame.
+        ValueError: detections without scores, or counts of wrong shape; the message names the frame.
     """
 
     detections: Boxes
@@ -85,7 +85,7 @@ class Scene:
     """A frame prepared for matching.
 
     Attributes:
-        detections: N boxes inside the range, best score first, equal scores in their order of before.
+        detections: N boxes inside the range, by descending score (stable).
         rows: (N,) their rows in the frame's detections.
         score: (N,) their scores.
         truth: K boxes.
@@ -106,7 +106,7 @@ def prepare(frame: DetectionFrame, evaluation_range: EvaluationRange | None = No
 
     Args:
         frame: the frame.
-        evaluation_range: None for everywhere.
+        evaluation_range: None for unlimited.
         min_points: objects with fewer points in them are ignored.
 
     Raises:
@@ -125,7 +125,7 @@ def prepare(frame: DetectionFrame, evaluation_range: EvaluationRange | None = No
 
 
 def inside(boxes: Boxes, evaluation_range: EvaluationRange | None) -> BoolArray:
-    """(N,) whether a box's centre is in the range; the borders belong to it."""
+    """(N,) whether the centre of each box is in the range, borders included."""
     if evaluation_range is None:
         return np.ones(len(boxes), dtype=np.bool_)
     x_min, x_max, y_min, y_max = evaluation_range
@@ -137,14 +137,14 @@ def inside(boxes: Boxes, evaluation_range: EvaluationRange | None) -> BoolArray:
 
 
 def match(scene: Scene, threshold: float) -> IntArray:
-    """Row of the truth that each detection found, `FALSE` or `DROPPED`; the module's text says how.
+    """Match detections to objects, as defined in the module docstring.
 
     Args:
-        scene: N detections, best first, and K objects.
-        threshold: least IoU of a true detection.
+        scene: N detections by descending score, and K objects.
+        threshold: minimum IoU of a true detection.
 
     Returns:
-        (N,) rows in [0, K), none twice, or one of the two negative values.
+        (N,) row of the matched object in [0, K), each at most once, or `FALSE` or `DROPPED`.
     """
     free = scene.counted.copy()
     on_ignored = (scene.iou[:, ~scene.counted] >= threshold).any(axis=1)
@@ -160,20 +160,20 @@ def match(scene: Scene, threshold: float) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """An object that was missed, or a detection of nothing; lengths in metres, angles in radians.
+    """A missed object or a false detection; lengths in metres, angles in radians.
 
     Attributes:
         kind: "missed" or "false".
         frame: name of the frame.
-        agent: whose frame it is.
+        agent: name of the agent.
         row: of the box in the frame's truth (missed) or detections (false).
-        label: of a missed object, where it has one.
+        label: of a missed object, if it has one.
         x, y, z, length, width, height, yaw: the box, in the agent's LiDAR frame.
-        distance: of its centre from the agent, seen from above [m].
-        points: in the box, None where they were not counted.
-        score: of a false detection; for a missed object, of the detection (of any score) that overlaps it most.
-        best_iou: with that detection; for a false detection, with any object of the truth. One with a large overlap is
-            a second detection of one object.
+        distance: horizontal distance of its centre from the agent [m].
+        points: number of points in the box; None if unknown.
+        score: of a false detection; for a missed object, of the detection (of any score) with the largest IoU.
+        best_iou: with that detection; for a false detection, the largest with any object: if it is large, the
+            detection is a duplicate.
     """
 
     kind: str
@@ -201,12 +201,12 @@ def find_failures(
     evaluation_range: EvaluationRange | None = None,
     min_points: int = 0,
 ) -> Iterator[Failure]:
-    """Every counted object that no detection of at least this score found, then every such detection that is false.
+    """Missed objects of a frame, then its false detections, at a score threshold.
 
     Args:
         frame: the frame.
-        threshold: least IoU of a true detection.
-        score_threshold: least score of a detection that is taken seriously.
+        threshold: minimum IoU of a true detection.
+        score_threshold: minimum score of the detections.
         evaluation_range: as in `prepare`.
         min_points: as in `prepare`.
     """
@@ -233,7 +233,7 @@ def _failure(
     score: float | None,
     best_iou: float,
 ) -> Failure:
-    """`row` is that of the box in `boxes`, `original` the one in the frame and in `counts`."""
+    """A failure from row `row` of `boxes`; `original` is its row in the frame and in `counts`."""
     x, y, z = boxes.center[row].tolist()
     length, width, height = boxes.size[row].tolist()
     return Failure(

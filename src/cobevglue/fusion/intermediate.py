@@ -28,7 +28,7 @@ from cobevglue.fusion.warp import coverage, warp
 from cobevglue.messages import Arrays
 from cobevglue.perception import DetectionLoss, PerceptionOutput, PointPillars, TargetBatch
 from cobevglue.perception.checkpoint import fingerprint, load_checkpoint, load_weights, save_checkpoint
-from cobevglue.perception.decode import Found, decode
+from cobevglue.perception.decode import Detections, decode
 from cobevglue.perception.head import HeadOutput
 from cobevglue.se2 import SE2
 
@@ -180,7 +180,7 @@ class IntermediateFusion(FusionMethod, nn.Module):
         (found,) = self.boxes(self.decode_maps([m[None] for m in fused]))
         return found.boxes
 
-    def boxes(self, output: HeadOutput) -> list[Found]:
+    def boxes(self, output: HeadOutput) -> list[Detections]:
         """The detections of each ego, best first."""
         return decode(output, self.anchors, self.detection)
 

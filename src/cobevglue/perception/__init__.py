@@ -1,6 +1,6 @@
-"""What one agent sees by itself: point cloud in, bird's-eye-view features and tracked boxes out (equation 1a).
+"""Perception of one agent: bird's-eye-view features and tracked boxes from a point cloud (equation 1a).
 
-The only networks of CoBEVGlue, so this is where PyTorch is imported; `import cobevglue` does without.
+Imports PyTorch; `import cobevglue` does not.
 """
 
 try:

@@ -1,6 +1,6 @@
-"""Anchors: the boxes that the head starts from, what it has to say of each, and back.
+"""Anchors: encoding and decoding of boxes relative to them, and assignment of targets.
 
-After SECOND (Yan et al., Sensors 2018), section 3.2. All in numpy, so that data-loader workers can do it.
+After SECOND (Yan et al., Sensors 2018), section 3.2. In numpy, for use in data-loader workers.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from cobevglue.typing import ArrayLike, BoolArray, Float32Array, FloatArray, Int
 
 __all__ = ["AnchorGrid", "Targets", "assign_targets"]
 
-_LARGEST = 3.0
-"""Residuals of size are cut here when decoded: no box is more than e^3 = 20 times its anchor."""
-_NEARER = 1e-4
-"""Overlap that a metre to the anchor's centre is worth, to choose among those that cover a small object alike."""
+_MAX_SIZE_RESIDUAL = 3.0
+"""Size residuals are clipped here when decoded: no box is more than e^3 = 20 times its anchor."""
+_DISTANCE_PENALTY = 1e-4
+"""Penalty per metre of centre distance, subtracted from the IoU: breaks ties of anchors that contain a small object."""
 
 
 class AnchorGrid:
-    """The N = rows x columns x types anchors of a configuration, and boxes told relative to them.
+    """The N = rows x columns x types anchors of a configuration, and boxes encoded relative to them.
 
-    A box (x, y, z, l, w, h, yaw) relative to anchor a is told by seven residuals,
+    A box (x, y, z, l, w, h, yaw) relative to anchor a is encoded by seven residuals,
 
         (x - x_a) / d,  (y - y_a) / d,  (z - z_a) / h_a,  log(l / l_a),  log(w / w_a),  log(h / h_a),  yaw - yaw_a
 
-    with d the diagonal of the anchor seen from above. The last is taken modulo pi, in (-pi/2, pi/2], and the direction
-    says which half turn: 0, the box faces along the anchor, or 1, against it. SECOND cuts directions at a fixed angle,
-    where two headings that differ by nothing get opposite labels; relative to an anchor that was assigned for being
-    the nearest of 0 and 90 degrees that cut is out of reach.
+    with d the horizontal diagonal of the anchor. The last is taken modulo pi, in (-pi/2, pi/2], and the direction is 0
+    if the box faces along the anchor, or 1 if against it. SECOND separates directions at a fixed angle, where two
+    almost equal headings get opposite labels. Relative to an assigned anchor, the nearest of 0 and 90 degrees, the
+    yaw difference does not reach the boundary.
 
     Attributes:
         rows: cells along y, from y_min.
@@ -59,13 +59,13 @@ class AnchorGrid:
     @property
     def extent(self) -> FloatArray:
         """(T, 2) sides of the types along x and y [m]."""
-        turned = self.yaw[:, None] > 0
-        extent: FloatArray = np.where(turned, self.size[:, 1::-1], self.size[:, :2])
+        rotated = self.yaw[:, None] > 0
+        extent: FloatArray = np.where(rotated, self.size[:, 1::-1], self.size[:, :2])
         return extent
 
     @property
     def diagonal(self) -> FloatArray:
-        """(T,) diagonals of the types seen from above [m]."""
+        """(T,) horizontal diagonals of the types [m]."""
         diagonal: FloatArray = np.hypot(self.size[:, 0], self.size[:, 1])
         return diagonal
 
@@ -77,7 +77,7 @@ class AnchorGrid:
         return np.column_stack([x, y, self.z[kind], self.size[kind], self.yaw[kind]])
 
     def encode(self, boxes: FloatArray, index: ArrayLike) -> tuple[FloatArray, IntArray]:
-        """Residuals (P, 7) and directions (P,) that tell boxes (P, 7) relative to anchors `index` (P,)."""
+        """Encode boxes (P, 7) relative to anchors `index` (P,) as residuals (P, 7) and directions (P,)."""
         anchors = self.boxes(index)
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
         turn = wrap_angle(boxes[:, 6] - anchors[:, 6])
@@ -94,7 +94,7 @@ class AnchorGrid:
         return residuals, against.astype(np.int64)
 
     def decode(self, residuals: ArrayLike, direction: ArrayLike, index: ArrayLike) -> FloatArray:
-        """The boxes (P, 7) that residuals (P, 7) and directions (P,) of anchors `index` (P,) tell; yaw in [-pi, pi)."""
+        """Decode residuals (P, 7) and directions (P,) of anchors `index` (P,) to boxes (P, 7); yaw in [-pi, pi)."""
         anchors = self.boxes(index)
         values = np.asarray(residuals, dtype=np.float64)
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
@@ -102,7 +102,7 @@ class AnchorGrid:
             [
                 anchors[:, :2] + values[:, :2] * diagonal,
                 anchors[:, 2] + values[:, 2] * anchors[:, 5],
-                anchors[:, 3:6] * np.exp(np.clip(values[:, 3:6], -_LARGEST, _LARGEST)),
+                anchors[:, 3:6] * np.exp(np.clip(values[:, 3:6], -_MAX_SIZE_RESIDUAL, _MAX_SIZE_RESIDUAL)),
                 wrap_angle(anchors[:, 6] + _half_turn(values[:, 6]) + math.pi * np.asarray(direction)),
             ]
         )
@@ -110,13 +110,13 @@ class AnchorGrid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """What the head should say of one cloud; anchors that are not named are background.
+    """Targets of the head for one cloud; all other anchors are background.
 
     Attributes:
-        positive: (P,) anchors that are to find an object, ascending.
+        positive: (P,) anchors with an assigned object, ascending.
         residuals: (P, 7) float32; see `AnchorGrid`.
         direction: (P,) 0 or 1.
-        ignored: (I,) anchors that count for neither.
+        ignored: (I,) anchors that are neither positive nor background.
     """
 
     positive: IntArray
@@ -126,23 +126,20 @@ class Targets:
 
 
 def assign_targets(boxes: ArrayLike, ignore: ArrayLike, anchors: AnchorGrid) -> Targets:
-    """Which anchor is to find which object.
+    """Assign objects to anchors by IoU.
 
-    Overlap is measured with headings rounded to the nearest of 0 and 90 degrees, as in SECOND: axis-aligned boxes are
-    fast to compare, and an anchor need not overlap by luck to learn a rotation. An object to which no anchor comes
-    near enough gets the best there is, so that a motorcycle is learnt too.
+    The IoU is computed with headings rounded to the nearest of 0 and 90 degrees, as in SECOND: axis-aligned boxes are
+    fast to compare, and the assignment does not depend on the rotation. An object without an anchor of sufficient IoU
+    is assigned to the best one, so that motorcycles are learnt, too.
 
     Args:
         boxes: (K, 7) x, y, z, l, w, h [m], yaw [rad] in the LiDAR's frame.
-        ignore: (K,) True for objects that cannot be asked for, for instance for want of points. They, and those whose
-            centre is out of range, keep the anchors around them from being called background, and are no targets.
+        ignore: (K,) True for objects that are not targets, for instance with too few points. Anchors around these and
+            around objects with a centre out of range are ignored instead of background.
         anchors: the grid.
 
-    Returns:
-        The targets of this cloud.
-
     Raises:
-        ValueError: wrong shapes, or boxes that are not finite or without size.
+        ValueError: wrong shapes, or boxes with non-finite values or sizes that are not positive.
     """
     boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 7) if np.size(boxes) == 0 else np.asarray(boxes, np.float64)
     ignore = np.asarray(ignore, dtype=bool)
@@ -159,24 +156,23 @@ def assign_targets(boxes: ArrayLike, ignore: ArrayLike, anchors: AnchorGrid) -> 
 
     best, owner = np.zeros(len(anchors)), np.full(len(anchors), -1)
     near = np.flatnonzero(~ignore[pairs.box] & (pairs.iou >= config.negative_iou))
-    near = near[np.argsort(pairs.iou[near], kind="stable")]  # the last one written stays: the best
+    near = near[np.argsort(pairs.iou[near], kind="stable")]  # ascending: the best overwrites the others
     best[pairs.anchor[near]] = pairs.iou[near]
     owner[pairs.anchor[near]] = pairs.box[near]
     owner[best < config.positive_iou] = -1
-    neither = best >= config.negative_iou
-    _give_the_rest_their_best(owner, pairs, ~ignore)
-    neither[pairs.anchor[ignore[pairs.box] & (pairs.iou >= config.ignore_iou)]] = True
+    not_background = best >= config.negative_iou
+    _assign_remaining(owner, pairs, ~ignore)
+    not_background[pairs.anchor[ignore[pairs.box] & (pairs.iou >= config.ignore_iou)]] = True
 
     positive = np.flatnonzero(owner >= 0)
     residuals, direction = anchors.encode(boxes[owner[positive]], positive)
-    return Targets(
-        positive, residuals.astype(np.float32), direction, np.flatnonzero(neither & (owner < 0)).astype(np.int64)
-    )
+    ignored = np.flatnonzero(not_background & (owner < 0)).astype(np.int64)
+    return Targets(positive, residuals.astype(np.float32), direction, ignored)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """P pairs of a box and an anchor that overlap, ascending by box: rows, overlap, distance of the centres [m]."""
+    """P overlapping pairs of a box and an anchor, ascending by box: indices, IoU, distance of the centres [m]."""
 
     box: IntArray
     anchor: IntArray
@@ -185,9 +181,9 @@ class _Pairs:
 
 
 def _overlaps(boxes: FloatArray, anchors: AnchorGrid) -> _Pairs:
-    """All pairs that overlap. Overlap along x depends on the column alone, along y on the row: two small tables."""
-    turned = np.abs(np.sin(boxes[:, 6])) > math.sqrt(0.5)
-    side = np.where(turned[:, None], boxes[:, 4:2:-1], boxes[:, 3:5])  # (K, 2) along x and y
+    """All overlapping pairs. The overlap along x depends only on the column, along y only on the row."""
+    rotated = np.abs(np.sin(boxes[:, 6])) > math.sqrt(0.5)
+    side = np.where(rotated[:, None], boxes[:, 4:2:-1], boxes[:, 3:5])  # (K, 2) along x and y
     reach = (side.max(initial=0.0) + anchors.extent.max()) / 2
     half = min(math.ceil(reach / anchors.cell), max(anchors.rows, anchors.columns)) + 1
     limits = anchors.origin, anchors.origin + np.array([anchors.columns, anchors.rows]) * anchors.cell
@@ -213,21 +209,21 @@ def _overlaps(boxes: FloatArray, anchors: AnchorGrid) -> _Pairs:
     return _Pairs(inside[k], index, iou, np.hypot(offsets[0][k, c], offsets[1][k, r]))
 
 
-def _give_the_rest_their_best(owner: IntArray, pairs: _Pairs, wanted: BoolArray) -> None:
-    """Boxes that own no anchor get the best one that is free; of two that want the same, the better fit comes first."""
-    poor = wanted.copy()
-    poor[owner[owner >= 0]] = False
-    merit = pairs.iou - _NEARER * pairs.distance
-    first = np.searchsorted(pairs.box, np.arange(len(wanted) + 1))
+def _assign_remaining(owner: IntArray, pairs: _Pairs, targets: BoolArray) -> None:
+    """Assign each target without an anchor to its best free one, in place; targets with the best fit come first."""
+    remaining = targets.copy()
+    remaining[owner[owner >= 0]] = False
+    quality = pairs.iou - _DISTANCE_PENALTY * pairs.distance
+    first = np.searchsorted(pairs.box, np.arange(len(targets) + 1))
     rows_of = {
-        box: np.arange(first[box], first[box + 1]) for box in np.flatnonzero(poor) if first[box] < first[box + 1]
+        box: np.arange(first[box], first[box + 1]) for box in np.flatnonzero(remaining) if first[box] < first[box + 1]
     }
-    for box in sorted(rows_of, key=lambda box: -merit[rows_of[box]].max()):
+    for box in sorted(rows_of, key=lambda box: -quality[rows_of[box]].max()):
         rows = rows_of[box][owner[pairs.anchor[rows_of[box]]] < 0]
         if len(rows):
-            owner[pairs.anchor[rows[merit[rows].argmax()]]] = box
+            owner[pairs.anchor[rows[quality[rows].argmax()]]] = box
 
 
 def _half_turn(angle: FloatArray) -> FloatArray:
-    """The same axis, in (-pi/2, pi/2]."""
+    """Angles modulo pi, in (-pi/2, pi/2]."""
     return angle - math.pi * np.ceil(angle / math.pi - 0.5)

@@ -1,7 +1,7 @@
-"""The convolutional part: three maps at strides 2, 4 and 8, and one map at stride 2 made of them.
+"""Convolutional backbone (feature maps at strides 2, 4 and 8) and neck (one map at stride 2).
 
-Residual blocks as in CoAlign (Lu et al., ICRA 2023), whose multi-scale fusion goes in between; the rest is SECOND's
-(Yan et al., Sensors 2018) and PointPillars' neck.
+Residual blocks as in CoAlign (Lu et al., ICRA 2023), whose multi-scale fusion is applied between backbone and neck; the
+neck is that of SECOND (Yan et al., Sensors 2018) and PointPillars.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Backbone", "Neck", "conv_norm"]
 
 
 def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, relu: bool = True) -> nn.Sequential:
-    """Convolution without bias, batch normalisation, ReLU if wanted."""
+    """Convolution without bias, batch normalisation, optional ReLU."""
     layers: list[nn.Module] = [
         nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False),
         nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01),
@@ -26,7 +26,7 @@ def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1, relu: boo
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut (He et al., CVPR 2016)."""
+    """Two 3 x 3 convolutions with a shortcut (He et al., CVPR 2016)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class ResidualBlock(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Three stages of residual blocks, each at half the resolution of the one before."""
+    """Three stages of residual blocks, each at half the resolution of the previous one."""
 
     def __init__(self, config: PointPillarsConfig) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Backbone(nn.Module):
 
 
 class Neck(nn.Module):
-    """Brings the three maps to stride 2, side by side, and shrinks that to the map the heads look at."""
+    """Upsample the three maps to stride 2, concatenate them, and reduce the channels to the input of the head."""
 
     def __init__(self, config: PointPillarsConfig) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
-"""Weights on disk: one safetensors file with the settings and what is known of the training in its header.
+"""Checkpoints: one safetensors file with the weights, and settings and training metadata in its header.
 
-Such a file holds numbers and text, no code: loading one from a stranger is safe.
+The file holds numbers and text but no code, so loading untrusted files is safe.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from cobevglue.relative_paths import without_absolute_paths
 __all__ = ["Checkpoint", "fingerprint", "load_checkpoint", "load_weights", "save_checkpoint"]
 
 _FORMAT = "1"
-"""Raised when files of the version before can no longer be read."""
+"""Incremented when files of the previous version can no longer be read."""
 _MAGIC = "cobevglue_format"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """What a file holds: settings as plain data, weights by name (float32), metadata as it was given."""
+    """Contents of a file: settings as plain data, float32 weights by name, and metadata."""
 
     config: dict[str, Any]
     weights: dict[str, Tensor]
@@ -44,15 +44,15 @@ def save_checkpoint(
     metadata: Mapping[str, Any] | None = None,
     half: bool = False,
 ) -> None:
-    """Write the weights of `module`. The file appears complete or not at all.
+    """Write the weights of `module` atomically.
 
     Args:
-        path: where to.
-        architecture: name of the kind of network, checked when loading.
-        config: its settings, as JSON can hold them.
+        path: of the file.
+        architecture: name of the network architecture, checked when loading.
+        config: its settings, JSON-serialisable.
         module: the network.
-        metadata: what else is known: data, metrics, seed; as JSON can hold it. Absolute paths in it become relative.
-        half: weights in float16, for half the size; statistics of the normalisation stay float32.
+        metadata: data, metrics, seed and the like, JSON-serialisable. Absolute paths in it are made relative.
+        half: store weights as float16, for half the size; statistics of the normalisation stay float32.
     """
     weights = {}
     for name, value in module.state_dict().items():
@@ -72,8 +72,8 @@ def load_checkpoint(path: str | Path, architecture: str) -> Checkpoint:
     """Read a file that `save_checkpoint` wrote.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged, not ours, of another version of the format, or of another architecture.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is damaged, not a checkpoint of CoBEVGlue, or of another format version or architecture.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -98,10 +98,10 @@ def load_checkpoint(path: str | Path, architecture: str) -> Checkpoint:
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Tensor], path: str | Path) -> None:
-    """Put weights into a network.
+    """Load weights into a network.
 
     Raises:
-        ValueError: they are not this network's, or not finite; names the first weight that differs.
+        ValueError: a weight is missing, unexpected, of wrong shape or not finite; the message names the first one.
     """
     own = module.state_dict()
     for name in sorted(own.keys() | weights.keys()):
@@ -118,7 +118,7 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], path: str | P
 
 
 def fingerprint(module: nn.Module) -> str:
-    """16 hexadecimal digits that are the same for networks with the same weights, and for no others."""
+    """Hash of the weights of a network, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for name, value in sorted(module.state_dict().items()):
         digest.update(name.encode())

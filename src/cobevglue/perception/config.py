@@ -1,4 +1,4 @@
-"""Settings of the detector, and the two that come with the package."""
+"""Settings of the detector, and the two shipped configurations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cobevglue.settings import Settings
 __all__ = ["CONFIGS", "STRIDES", "Anchor", "DetectionConfig", "PointPillarsConfig"]
 
 STRIDES = (2, 4, 8)
-"""Of the three feature maps, in pillars: each block of the backbone halves the map."""
+"""Strides of the three feature maps, in pillars: each stage of the backbone halves the resolution."""
 
 _Range = tuple[float, float]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -20,7 +20,7 @@ _Count = Annotated[int, Field(ge=1)]
 
 
 class Anchor(Settings):
-    """A box that the head starts from, at 0 and at 90 degrees in every cell.
+    """An anchor box, at 0 and at 90 degrees in every cell.
 
     Attributes:
         length: along the heading [m].
@@ -36,20 +36,20 @@ class Anchor(Settings):
 
 
 class DetectionConfig(Settings):
-    """How boxes are chosen from what the head says. No part of the weights: change it as you like.
+    """Settings of box decoding. Independent of the weights, so they may be changed after training.
 
     Attributes:
-        score_threshold: boxes that score less are not looked at.
-        candidates: how many of the best-scored go into non-maximum suppression.
-        nms_iou: rotated overlap up to which two boxes may both stay.
-        max_detections: how many stay at most.
+        score_threshold: minimum score of a box.
+        candidates: number of boxes of highest score that enter non-maximum suppression.
+        nms_iou: maximum rotated IoU of two detections.
+        max_detections: maximum number of detections.
         uncertainty_penalty: rank by score * exp(-penalty * standard deviation of x and y [m]) instead of the score; 0
-            ranks by the score. The scores handed out stay what they are.
-        variance_voting: let the suppressed boxes move those that stay: average of all that overlap by `voting_iou` or
-            more, weighted by the overlap and the inverse predicted variance (He et al., "Bounding Box Regression with
-            Uncertainty for Accurate Object Detection", CVPR 2019). Which way they face is put to the vote, too.
-        voting_iou: see there.
-        heading_refinement: let the points on each box say which way it faces (`perception/heading.py`).
+            ranks by the score. The returned scores are not changed.
+        variance_voting: replace each detection by the average of all candidates with an IoU of `voting_iou` or more,
+            weighted by the IoU and the inverse predicted variance (He et al., "Bounding Box Regression with
+            Uncertainty for Accurate Object Detection", CVPR 2019). The direction is decided by a weighted vote, too.
+        voting_iou: minimum IoU of candidates in `variance_voting`.
+        heading_refinement: classify front and back from the points on each box (`perception/heading.py`).
     """
 
     score_threshold: _Share = 0.1
@@ -63,27 +63,27 @@ class DetectionConfig(Settings):
 
 
 class PointPillarsConfig(Settings):
-    """Settings of `PointPillars`: what it sees, the network's size, its anchors.
+    """Settings of `PointPillars`: range, size of the network, anchors.
 
     Attributes:
-        x_range: what is looked at along x, in the LiDAR's frame [m].
+        x_range: detection range along x, in the LiDAR's frame [m].
         y_range: along y [m].
         z_range: along z [m].
         pillar: side of a pillar [m].
-        use_intensity: give the network the points' intensity; not where each sensor means something else by it.
+        use_intensity: use the intensity of points; not recommended for sensors with different definitions of it.
         pillar_channels: channels of the pseudo-image, a multiple of 16: on AVX-512 processors torch 2.13 (oneDNN) may
             write beyond its buffers in the backward pass of a first convolution with 12 input channels. Other
             versions of torch were not tried.
         block_layers: residual blocks at strides 2, 4 and 8.
         block_channels: their channels.
-        up_channels: channels that each of the three maps is brought to at stride 2.
-        shrink_channels: channels of the map the heads look at.
-        shrink_kernel: kernel of the first of the two convolutions that get there; the second is 3 x 3.
+        up_channels: channels of each of the three maps after upsampling to stride 2.
+        shrink_channels: channels of the input of the head.
+        shrink_kernel: kernel of the first of the two convolutions in front of the head; the second is 3 x 3.
         anchors: box sizes in every cell, each at 0 and 90 degrees.
-        positive_iou: anchors that overlap an object by this are to find it.
-        negative_iou: anchors that overlap all objects by less are background; what lies between counts for neither.
-        ignore_iou: anchors that overlap an object that cannot be asked for (too few points) by this count for neither.
-        detection: how boxes are chosen.
+        positive_iou: minimum IoU of an anchor with its object.
+        negative_iou: anchors with a smaller IoU with all objects are background; those in between are ignored.
+        ignore_iou: anchors with this IoU with an ignored object (too few points) are ignored.
+        detection: settings of box decoding.
 
     Raises:
         ValueError: a value out of range, an unknown field, an empty range, one that is no multiple of 8 pillars, or
@@ -143,12 +143,12 @@ class PointPillarsConfig(Settings):
 
     @property
     def head_shape(self) -> tuple[int, int, int]:
-        """Rows, columns and anchors per cell of what the head says."""
+        """Rows, columns and anchors per cell of the output of the head."""
         return self.rows // STRIDES[0], self.columns // STRIDES[0], 2 * len(self.anchors)
 
 
 _VOTING = DetectionConfig(variance_voting=True)
-"""Worth one point of AP at IoU 0.7 on the simulated validation split (`benchmarks/detection_settings.py`)."""
+"""Improves AP at IoU 0.7 by one point on the simulated validation split (`benchmarks/detection_settings.py`)."""
 
 CONFIGS: dict[str, PointPillarsConfig] = {
     "opv2v": PointPillarsConfig(
@@ -166,6 +166,6 @@ CONFIGS: dict[str, PointPillarsConfig] = {
     ),
     "compact": PointPillarsConfig(detection=_VOTING),
 }
-"""`opv2v`: the size that the papers on OPV2V use (with residual blocks, as CoAlign and CoBEVGlue do), for a GPU. They
-give it intensity, which in OPV2V's clouds is a function of the range, and in others something else; here it has none.
-`compact`: about a million weights, for a CPU; roadside LiDARs, vans, buses and lorries too."""
+"""`opv2v`: the size used in papers on OPV2V (with residual blocks, as in CoAlign and CoBEVGlue), for a GPU. Unlike
+there, intensity is not used: in OPV2V's clouds it is a function of the range, which does not hold for real sensors.
+`compact`: about a million weights, for a CPU; also for roadside LiDARs, vans, buses and lorries."""

@@ -1,4 +1,4 @@
-"""What the network says of every anchor: an object or not, where it is, which way it faces, and how sure that is."""
+"""Detection head: objectness, box residuals, direction and variance of every anchor."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from cobevglue.perception.config import PointPillarsConfig
 __all__ = ["Head", "HeadOutput"]
 
 _PRIOR = 0.01
-"""Share of objects among anchors that an untrained head expects: without it the background's loss drowns the first
-steps (Lin et al., "Focal Loss", ICCV 2017, section 3.3)."""
+"""Initial probability of an object, so that the loss of the background does not dominate the first steps (Lin et al.,
+"Focal Loss", ICCV 2017, section 3.3)."""
 
 
 class HeadOutput(NamedTuple):
-    """Raw output for B clouds, in float32. N anchors: rows (y) x columns (x) x anchors of a cell, the last fastest.
+    """Raw output for B clouds, in float32, of N anchors in the order rows (y), columns (x), anchors of a cell.
 
     `output.logits.view(B, *config.head_shape)` is a map.
 
     Attributes:
-        logits: (B, N) of an object.
+        logits: (B, N) objectness.
         residuals: (B, N, 7) from the anchor to the box; see `AnchorGrid`.
         direction: (B, N, 2) logits: facing along the anchor, or against it.
         log_variance: (B, N, 3) natural logarithm of the variance of x and y [m^2] and yaw [rad^2].
@@ -53,7 +53,7 @@ class Head(nn.Module):
             nn.init.normal_(conv.weight, std=0.001)
 
     def forward(self, x: Tensor) -> HeadOutput:
-        """(B, C, H, W) to what is said of B x N anchors."""
+        """Feature map (B, C, H, W) to the output of B x N anchors."""
 
         def per_anchor(values: Tensor, number: int) -> Tensor:
             # Free where the map is laid out channels-last.

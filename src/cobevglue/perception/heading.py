@@ -1,4 +1,4 @@
-"""Heading refinement: a second stage that decides, for each detected vehicle, which of its two ends is the front.
+"""Heading refinement: a second stage that classifies the front and the back of each detected vehicle.
 
 The detection head estimates the axis of a vehicle well but confuses front and back: the difference lies in the slope of
 a windscreen or the length of a bonnet, which is smaller than a pillar. This stage classifies the raw points of each
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from cobevglue.datasets.labelled_cloud import points_at
-from cobevglue.perception.decode import Found
+from cobevglue.perception.decode import Detections
 from cobevglue.typing import Float32Array
 
 __all__ = ["HeadingInputs", "HeadingRefiner", "heading_inputs", "refine_headings"]
@@ -26,7 +26,7 @@ _POINTS = 64
 _MARGIN = 0.3
 """Enlargement of a box on every side when its points are collected [m]."""
 _BELOW, _ABOVE = 0.1, 0.4
-"""Enlargement downwards, where the ground is near, and upwards [m]."""
+"""Enlargement downwards, less because of the ground, and upwards [m]."""
 _VEHICLES = 16
 """Number of nearest neighbours that are used for each vehicle."""
 _CHANNELS = 64
@@ -51,16 +51,16 @@ class HeadingInputs(NamedTuple):
     around: Tensor
 
 
-def heading_inputs(points: Float32Array, found: Found) -> HeadingInputs:
+def heading_inputs(points: Float32Array, detections: Detections) -> HeadingInputs:
     """Collect the inputs of the `HeadingRefiner` from a cloud and the detections in it.
 
     Args:
-        points: (N, 4) x, y, z [m], intensity, in the LiDAR frame; rows with NaN lie in no box.
-        found: K detections in the same frame.
+        points: (N, 4) x, y, z [m], intensity, in the LiDAR frame; rows with NaN are ignored.
+        detections: K detections in the same frame.
     """
-    boxes = found.boxes
+    boxes = detections.boxes
     assert boxes.score is not None
-    taken = np.zeros((len(boxes), _POINTS, 3), dtype=np.float32)
+    sampled = np.zeros((len(boxes), _POINTS, 3), dtype=np.float32)
     number = np.zeros(len(boxes), dtype=np.int64)
     for row, (_, at) in enumerate(points_at(points, boxes, _MARGIN)):
         half = boxes.size[row, 2] / 2.0
@@ -68,15 +68,15 @@ def heading_inputs(points: Float32Array, found: Found) -> HeadingInputs:
         number[row] = len(on)
         if len(on) > _POINTS:
             on = on[np.arange(_POINTS) * len(on) // _POINTS]
-        taken[row, : len(on)] = on
-    vehicle = np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.score, found.heading_confidence])
-    arrays = taken, number, vehicle.astype(np.float32), _around(found)
+        sampled[row, : len(on)] = on
+    vehicle = np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.score, detections.heading_confidence])
+    arrays = sampled, number, vehicle.astype(np.float32), _neighbours(detections)
     return HeadingInputs(*(torch.from_numpy(values) for values in arrays))
 
 
-def _around(found: Found) -> Float32Array:
-    """(K, M, 6), see `HeadingInputs`."""
-    boxes = found.boxes
+def _neighbours(detections: Detections) -> Float32Array:
+    """(K, M, 6) `around` of `HeadingInputs`."""
+    boxes = detections.boxes
     around = np.zeros((len(boxes), _VEHICLES, 6), dtype=np.float32)
     if len(boxes) < 2:
         return around
@@ -89,7 +89,7 @@ def _around(found: Found) -> Float32Array:
     c, s = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
     turn = boxes.yaw[rows] - boxes.yaw[:, None]
     along, across = c * gap[..., 0] + s * gap[..., 1], c * gap[..., 1] - s * gap[..., 0]
-    columns = along, across, np.cos(turn), np.sin(turn), boxes.score[rows], found.heading_confidence[rows]
+    columns = along, across, np.cos(turn), np.sin(turn), boxes.score[rows], detections.heading_confidence[rows]
     around[:, : rows.shape[1]] = np.stack(columns, axis=-1)
     return around
 
@@ -116,7 +116,7 @@ class HeadingRefiner(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, inputs: HeadingInputs) -> Tensor:
-        """(K,) logits that the heading is right; negative where the opposite heading is more likely."""
+        """(K,) logits that the heading is correct; negative where the opposite heading is more likely."""
         return (self._front(inputs, 1.0) - self._front(inputs, -1.0)).float()
 
     def _front(self, inputs: HeadingInputs, sign: float) -> Tensor:
@@ -134,30 +134,31 @@ class HeadingRefiner(nn.Module):
         c, s = sign * yaw.cos(), sign * yaw.sin()
         x, y = center[:, :1], center[:, 1:2]
         distance = torch.hypot(x, y).clamp(min=1e-3)
-        from_ahead, from_the_left = -(c * x + s * y) / distance, (s * x - c * y) / distance  # of the sensor
-        facts = [size / 3.0, from_ahead, from_the_left, distance / _FAR, torch.log1p(number[:, None].float()) / 3.0]
-        facts += [score, 3.0 * sign * confidence]
-        parts = [pooled, others.amax(dim=1), others.sum(dim=1) / 4.0, *facts]
-        answer: Tensor = self.vehicle(torch.cat(parts, dim=1))
-        return answer[:, 0]
+        # Direction to the sensor, in the vehicle's axes.
+        from_ahead, from_the_left = -(c * x + s * y) / distance, (s * x - c * y) / distance
+        scalars = [size / 3.0, from_ahead, from_the_left, distance / _FAR, torch.log1p(number[:, None].float()) / 3.0]
+        scalars += [score, 3.0 * sign * confidence]
+        parts = [pooled, others.amax(dim=1), others.sum(dim=1) / 4.0, *scalars]
+        logits: Tensor = self.vehicle(torch.cat(parts, dim=1))
+        return logits[:, 0]
 
 
 @torch.inference_mode()
-def refine_headings(found: Found, points: Float32Array, net: HeadingRefiner) -> Found:
+def refine_headings(detections: Detections, points: Float32Array, net: HeadingRefiner) -> Detections:
     """Detections with refined headings: rotated by 180 degrees where the refiner's logit is negative.
 
     Args:
-        found: K detections.
+        detections: K detections.
         points: (N, 4) x, y, z [m], intensity, in the LiDAR frame.
         net: in evaluation mode.
 
     Returns:
-        The same detections; `heading_confidence` is the refiner's.
+        The detections, with the `heading_confidence` of the refiner.
     """
-    if not len(found.boxes):
-        return found
+    if not len(detections.boxes):
+        return detections
     device = next(net.parameters()).device
-    logits = net(HeadingInputs(*(t.to(device) for t in heading_inputs(points, found)))).double().cpu().numpy()
-    return found._replace(
-        boxes=found.boxes.turned_round(logits < 0.0), heading_confidence=np.tanh(np.abs(logits) / 2.0)
+    logits = net(HeadingInputs(*(t.to(device) for t in heading_inputs(points, detections)))).double().cpu().numpy()
+    return detections._replace(
+        boxes=detections.boxes.turned_round(logits < 0.0), heading_confidence=np.tanh(np.abs(logits) / 2.0)
     )

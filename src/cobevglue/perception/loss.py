@@ -1,7 +1,7 @@
-"""What the detector learns from: focal loss, smooth L1, direction, and how far off it expects to be.
+"""Detection loss: focal loss, smooth L1, cross-entropy of the direction, and likelihood of the predicted variance.
 
-Classes and boxes as in SECOND (Yan et al., Sensors 2018), section 3.2; the uncertainty as in the first stage of CoAlign
-(Lu et al., ICRA 2023).
+Classification and boxes as in SECOND (Yan et al., Sensors 2018), section 3.2; uncertainty as in the first stage of
+CoAlign (Lu et al., ICRA 2023).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -9.0, 4.0
-"""Standard deviations are kept between 1 cm (0.6 degrees) and 7 m: outside, the loss would be all about them."""
+"""Standard deviations are clamped between 1 cm (0.6 degrees) and 7 m, so that they do not dominate the loss."""
 
 _Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -44,12 +44,12 @@ class LossConfig(Settings):
     Attributes:
         classification: of the focal loss.
         box: of the smooth L1 loss of the residuals.
-        direction: of the cross-entropy of the direction; SECOND has 0.2, with which one box in seven stays flipped
-            in as few steps as a CPU can do.
+        direction: of the cross-entropy of the direction. With SECOND's 0.2, one box in seven is still flipped after
+            the number of steps that a CPU can train.
         uncertainty: of the negative log-likelihood of the errors under the predicted variances.
-        alpha: share of the positives in the focal loss.
-        gamma: how little anchors count that are right already.
-        beta: residual where smooth L1 turns from square to linear.
+        alpha: weight of the positives in the focal loss.
+        gamma: focusing parameter of the focal loss.
+        beta: residual at which smooth L1 changes from quadratic to linear.
     """
 
     classification: _Weight = 1.0
@@ -62,7 +62,7 @@ class LossConfig(Settings):
 
 
 class LossTerms(NamedTuple):
-    """Scalars. `total` is the weighted sum to minimise; the others are without their weights, to be logged."""
+    """Scalar terms of the loss: `total` is the weighted sum to minimise, the others are unweighted, for logging."""
 
     total: Tensor
     classification: Tensor
@@ -73,13 +73,13 @@ class LossTerms(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetBatch:
-    """The targets of B clouds. Anchors are numbered through: b * N + anchor.
+    """The targets of B clouds. Anchors are indexed over the batch: b * N + anchor.
 
     Attributes:
-        positive: (P,) anchors that are to find an object.
+        positive: (P,) anchors with an assigned object.
         residuals: (P, 7).
         direction: (P,).
-        ignored: (I,) anchors that count for neither.
+        ignored: (I,) anchors that are neither positive nor background.
     """
 
     positive: Tensor
@@ -88,17 +88,17 @@ class TargetBatch:
     ignored: Tensor
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> TargetBatch:
-        """The same on another device."""
+        """Copy to a device."""
         tensors = (self.positive, self.residuals, self.direction, self.ignored)
         return TargetBatch(*(t.to(device, non_blocking=non_blocking) for t in tensors))
 
 
 def collate_targets(targets: Sequence[Targets], anchors: int) -> TargetBatch:
-    """The targets of several clouds as one batch.
+    """Collate the targets of several clouds into one batch.
 
     Args:
         targets: of each cloud.
-        anchors: N, how many anchors a cloud has: `len(AnchorGrid(config))`.
+        anchors: N, the number of anchors of a cloud: `len(AnchorGrid(config))`.
     """
 
     def joined(parts: Sequence[object]) -> Tensor:
@@ -125,8 +125,8 @@ class DetectionLoss:
         self._diagonal = torch.tensor(AnchorGrid(config).diagonal, dtype=torch.float32)
 
     def __call__(self, output: HeadOutput, targets: TargetBatch) -> LossTerms:
-        """How far `output` is from `targets`; finite also where there is nothing to find."""
-        # Half precision is for the convolutions: exponentials and sums are not safe in it.
+        """Compute the terms of the loss; finite also without positives."""
+        # Half precision is for the convolutions only: exponentials and sums need float32.
         with torch.autocast(output.logits.device.type, enabled=False):
             return self._terms(HeadOutput(*(values.float() for values in output)), targets)
 
@@ -139,7 +139,7 @@ class DetectionLoss:
 
         classification = self._focal(output.logits.flatten(), targets) / number
         error = residuals - targets.residuals
-        # Headings modulo pi; the direction has the rest (SECOND, equation 6).
+        # Headings modulo pi; the direction is a separate term (SECOND, equation 6).
         bounded = torch.cat([error[:, :6], error[:, 6:].sin()], dim=1)
         box = F.smooth_l1_loss(bounded, torch.zeros_like(bounded), reduction="sum", beta=w.beta) / number
         direction = (
@@ -150,25 +150,25 @@ class DetectionLoss:
         return LossTerms(total, classification, box, direction, uncertainty)
 
     def _focal(self, logits: Tensor, targets: TargetBatch) -> Tensor:
-        """Sum of the focal loss over all anchors but the ignored. Nearly all are background."""
+        """Sum of the focal loss over all anchors that are not ignored."""
         w = self.weights
         background = torch.ones_like(logits)
         background[targets.positive] = 0.0
         background[targets.ignored] = 0.0
         negative = background * logits.sigmoid().pow(w.gamma) * F.softplus(logits)
-        found = logits[targets.positive]
-        positive = (-found).sigmoid().pow(w.gamma) * F.softplus(-found)
+        objects = logits[targets.positive]
+        positive = (-objects).sigmoid().pow(w.gamma) * F.softplus(-objects)
         return (1.0 - w.alpha) * negative.sum() + w.alpha * positive.sum()
 
 
 def _negative_log_likelihood(error: Tensor, diagonal: Tensor, log_variance: Tensor) -> Tensor:
-    """Sum of the negative log-likelihood of errors, up to constants: it is least where the variance is the true one.
+    """Sum of the negative log-likelihood of errors, up to constants; minimal where the variance is the true one.
 
-    x and y [m] are normal. The heading follows von Mises' distribution with concentration 1 / variance, which is the
-    normal one on a circle; headings differ modulo pi here, a flipped box is no uncertain one.
+    x and y [m] are normally distributed. The heading has a von Mises distribution with concentration 1 / variance, the
+    analogue on a circle; its error is taken modulo pi, so that flips do not increase the variance.
 
     Args:
-        error: (P, 7) of the residuals, detached: being wrong shall not pay.
+        error: (P, 7) of the residuals, detached, so that the term trains the variances only.
         diagonal: (P,) of the anchors [m].
         log_variance: (P, 3) predicted, of x, y [m^2] and yaw [rad^2].
     """
@@ -178,6 +178,6 @@ def _negative_log_likelihood(error: Tensor, diagonal: Tensor, log_variance: Tens
     normal = 0.5 * (position * precision[:, :2] + log_variance[:, :2])
     turn = error[:, 6] - math.pi * torch.round(error[:, 6] / math.pi)
     concentration = precision[:, 2]
-    # log I0(k) - k cos(turn), written so that neither overflows.
+    # log I0(k) - k cos(turn), in a form that does not overflow.
     von_mises = torch.log(torch.special.i0e(concentration)) + concentration * (1.0 - torch.cos(turn))
     return normal.sum() + von_mises.sum()

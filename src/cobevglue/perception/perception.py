@@ -1,4 +1,4 @@
-"""Equation (1a) of CoBEVGlue: from one agent's points to its features and its tracked boxes."""
+"""Perception of one agent, equation (1a) of CoBEVGlue: features and tracked boxes from a point cloud."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class PerceptionOutput:
     Attributes:
         points: (N, 4) float32 x, y, z [m], intensity: the normalised cloud.
         features: three maps (C, rows, columns) at strides 2, 4 and 8, on the detector's device.
-        boxes: the tracked detections, with `track_id`: those that the agent transmits. Front or back is decided by
-            the votes of all detections of a track; everything else is of this frame.
+        boxes: the tracked detections with `track_id`, which the agent transmits. Front and back are decided by a vote
+            of all detections of a track; everything else is of this frame.
         variance: (K, 3) predicted variance of x, y [m^2] and yaw [rad^2] of the K `boxes`.
-        detections: all detections, best first, down to the detector's own threshold, with the headings of `boxes`.
+        detections: all detections above the detector's threshold, by descending score, with the headings of `boxes`.
         seconds: time spent in each stage [s].
         height_correction: the offset added to z [m] (`estimate_height_correction`), so that the ground is at the same
             height for all agents; 0 for a sensor on a car's roof.
-        dropped_points: number of points without a valid return: not finite, or at (0, 0, 0).
+        dropped_points: number of invalid points: not finite, or at (0, 0, 0).
     """
 
     points: Float32Array
@@ -48,12 +48,12 @@ class PerceptionOutput:
 
 
 class Perception:
-    """Detector and tracker of one agent. Agents may share a detector, never a tracker.
+    """Detector and tracker of one agent. Agents may share a detector but not a tracker.
 
     Args:
         detector: in evaluation mode.
         tracker: with default settings if None.
-        min_track_score: detections that score less are neither tracked nor transmitted: for alignment a false box is
+        min_track_score: detections with lower scores are neither tracked nor transmitted: for alignment a false box is
             worse than a missing one.
     """
 
@@ -65,19 +65,19 @@ class Perception:
         self.min_track_score = min_track_score
 
     def reset(self) -> None:
-        """Forget all tracks."""
+        """Delete all tracks."""
         self.tracker.reset()
 
     @torch.inference_mode()
     def step(self, points: ArrayLike, time: float | None = None) -> PerceptionOutput:
-        """The next frame.
+        """Process the next frame.
 
         Args:
             points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame.
-            time: when it was taken [s]; by default the tracker's period after the last.
+            time: time stamp [s]; by default the tracker's period after the previous one.
 
         Raises:
-            ValueError: `points` is not numbers of shape (N, 4), or `time` is not later than the last.
+            ValueError: `points` is not numeric of shape (N, 4), or `time` is not later than the previous one.
         """
         checked = check_points(points)
         dropped = len(np.asarray(points)) - len(checked)
@@ -91,9 +91,9 @@ class Perception:
         with self._timed("head", seconds):
             output = self.detector.decode_features((first, second, third))
         with self._timed("boxes", seconds):
-            (found,) = self.detector.boxes(output)
+            (unrefined,) = self.detector.boxes(output)
         with self._timed("heading", seconds):
-            detections, variance, heading_confidence = self.detector.refine_headings(found, checked)
+            detections, variance, heading_confidence = self.detector.refine_headings(unrefined, checked)
         with self._timed("tracking", seconds):
             assert detections.score is not None
             good = detections.score >= self.min_track_score
@@ -108,6 +108,6 @@ class Perception:
     def _timed(self, stage: str, seconds: dict[str, float]) -> Iterator[None]:
         start = perf_counter()
         yield
-        if self.detector.device.type == "cuda":  # which answers before it is done
+        if self.detector.device.type == "cuda":  # kernels run asynchronously
             torch.cuda.synchronize(self.detector.device)
         seconds[stage] = perf_counter() - start

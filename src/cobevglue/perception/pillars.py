@@ -1,7 +1,7 @@
-"""From a point cloud to a pseudo-image: a feature vector for each vertical column that has points.
+"""Pillar encoder: from a point cloud to a pseudo-image with a feature vector for each non-empty pillar.
 
-After Lang et al., "PointPillars" (CVPR 2019), section 2.1, with the dynamic grouping of Zhou et al. (CoRL 2019): all
-points count and all pillars, there are no caps and no padding.
+After Lang et al., "PointPillars" (CVPR 2019), section 2.1, with the dynamic voxelisation of Zhou et al. (CoRL 2019): no
+limits on the numbers of points and pillars, and no padding.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ __all__ = ["PillarEncoder", "batch_clouds"]
 
 
 def batch_clouds(clouds: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Several clouds (N_i, 4) as one: (M, 4) points, and (M,) which cloud each is from."""
+    """Concatenate clouds (N_i, 4) to (M, 4) points, with the (M,) cloud index of each."""
     counts = torch.tensor([len(cloud) for cloud in clouds], device=clouds[0].device)
     return torch.cat(list(clouds)), torch.repeat_interleave(counts)
 
 
 class PillarEncoder(nn.Module):
-    """Describes each point within its pillar, lifts that by a linear layer, and takes the maximum over the pillar.
+    """Linear layer on the features of each point, and maximum over each pillar.
 
-    A point is described by where it is (x, y, z), its offsets from the mean of its pillar's points (3) and from the
-    pillar's centre (3), each scaled to about -1..1, and its intensity where the settings say so.
+    The features of a point are its coordinates (3), its offsets from the mean of its pillar's points (3) and from the
+    pillar's centre (3), each scaled to about -1..1, and its intensity if `use_intensity` is set.
     """
 
     low: Tensor
@@ -43,19 +43,19 @@ class PillarEncoder(nn.Module):
         self.norm = nn.BatchNorm1d(config.pillar_channels, eps=1e-3, momentum=0.01)
 
     def forward(self, points: Tensor, cloud: Tensor, clouds: int) -> Tensor:
-        """The pseudo-image of `clouds` clouds.
+        """Compute the pseudo-image of B clouds.
 
         Args:
-            points: (M, 4) x, y, z [m], intensity, of all clouds. Points out of range, or with a coordinate
-                that is not finite, are dropped; an intensity that is not finite counts as 0.
-            cloud: (M,) integers, the cloud that each point is from.
-            clouds: how many there are, B; any may be empty.
+            points: (M, 4) x, y, z [m], intensity, of all clouds. Points out of range or with non-finite coordinates
+                are dropped; a non-finite intensity is replaced by 0.
+            cloud: (M,) cloud index of each point.
+            clouds: B, the number of clouds; any may be empty.
 
         Returns:
-            (B, C, rows, columns), laid out channels-last; rows are y and columns x, both from min to max. Pillars
-            without points are 0.
+            (B, C, rows, columns) in channels-last memory format; rows along y and columns along x, both from min to
+            max. Empty pillars are 0.
         """
-        # In bfloat16 a point at 100 m would be off by half a metre.
+        # In bfloat16 the rounding error at 100 m would be half a metre.
         with torch.autocast(points.device.type, enabled=False):
             return self._forward(points.float(), cloud, clouds)
 
@@ -71,22 +71,22 @@ class PillarEncoder(nn.Module):
         pillar = (cloud * rows + xy[:, 1].long()) * columns + xy[:, 0].long()
 
         features = (
-            self.norm(self.linear(self._describe(points, xy, pillar, clouds)))
+            self.norm(self.linear(self._point_features(points, xy, pillar, clouds)))
             if len(points)
             else points.new_zeros(0, channels)
         )
         canvas: Tensor = _ScatterMax.apply(features, pillar, clouds * rows * columns)  # type: ignore[no-untyped-call]
         return canvas.view(clouds, rows, columns, channels).permute(0, 3, 1, 2)
 
-    def _describe(self, points: Tensor, cell: Tensor, pillar: Tensor, clouds: int) -> Tensor:
-        """(M, 9 or 10) what the network is told of each point."""
+    def _point_features(self, points: Tensor, cell: Tensor, pillar: Tensor, clouds: int) -> Tensor:
+        """(M, 9 or 10) features of each point."""
         size = torch.cat([points.new_full((2,), self.config.pillar), (self.high - self.low)[2:]])
         center = torch.cat(
             [self.low[:2] + (cell + 0.5) * size[:2], ((self.low + self.high) / 2)[2:].expand(len(cell), 1)], 1
         )
         xyz = points[:, :3]
         from_center = xyz - center
-        # Sums of offsets, not of coordinates: those would lose digits.
+        # Sums of offsets instead of coordinates, for precision.
         sums = points.new_zeros(clouds * self.config.rows * self.config.columns, 4)
         sums.index_add_(0, pillar, torch.cat([from_center, torch.ones_like(xyz[:, :1])], 1))
         mean = sums[pillar]
@@ -102,10 +102,10 @@ class PillarEncoder(nn.Module):
 
 
 class _ScatterMax(torch.autograd.Function):
-    """Maximum of 0 and all rows that go to the same place: ReLU and pooling in one.
+    """Maximum of 0 and all rows with the same index: ReLU and max pooling in one.
 
-    PyTorch's own `scatter_reduce` takes ten times longer back than forth on a CPU, since it shares the gradient evenly
-    among equals. Here each gets it in full; equals are points at the same place.
+    The backward pass of PyTorch's `scatter_reduce` takes ten times longer than the forward pass on a CPU, since it
+    divides the gradient evenly among ties. Here each gets it in full; ties are points at the same position.
     """
 
     @staticmethod
@@ -118,7 +118,7 @@ class _ScatterMax(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        """To the rows that won; to none where 0 did."""
+        """Gradient of the rows that are the maximum; 0 for all others."""
         rows, index, out = ctx.saved_tensors
-        won = (rows == out[index]) & (rows > 0)
-        return grads[0][index] * won, None, None
+        is_maximum = (rows == out[index]) & (rows > 0)
+        return grads[0][index] * is_maximum, None, None

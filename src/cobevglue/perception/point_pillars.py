@@ -1,4 +1,4 @@
-"""The detector: PointPillars with a residual backbone, in plain PyTorch."""
+"""PointPillars detector with a residual backbone, in plain PyTorch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cobevglue.perception.anchors import AnchorGrid
 from cobevglue.perception.backbone import Backbone, Neck
 from cobevglue.perception.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from cobevglue.perception.config import PointPillarsConfig
-from cobevglue.perception.decode import Found, decode
+from cobevglue.perception.decode import Detections, decode
 from cobevglue.perception.ground_height import correct_height, estimate_height_correction
 from cobevglue.perception.head import Head, HeadOutput
 from cobevglue.perception.heading import HeadingRefiner, refine_headings
@@ -34,23 +34,23 @@ _WEIGHTS = Path(__file__).parent / "weights"
 
 
 class PointPillars(nn.Module):
-    """Finds vehicles in a point cloud (Lang et al., "PointPillars", CVPR 2019).
+    """Detector of vehicles in point clouds (Lang et al., "PointPillars", CVPR 2019).
 
         detector = PointPillars.pretrained("compact")
         boxes = detector.detect(points)  # (N, 4) x, y, z, intensity
 
-    In three steps, so that fusion fits between: `forward` is `decode_features(multiscale(encode(clouds)))`. All maps
-    are (B, C, rows, columns); rows go along y and columns along x, both from min to max. `detect` adds heading
+    `forward` is `decode_features(multiscale(encode(clouds)))`, so that fusion can be applied between the steps. All
+    maps are (B, C, rows, columns); rows along y and columns along x, both from min to max. `detect` adds heading
     refinement (`heading_refiner`), a second stage on the points of each detection, which is trained separately.
 
     Args:
-        config: settings; `CONFIGS` has two. Weights are random, from torch's generator.
+        config: settings; two are in `CONFIGS`. Weights are initialised from torch's random generator.
 
     Attributes:
         config: the settings.
-        detection: how boxes are chosen, `config.detection` at first; may be changed at any time.
-        anchors: the boxes that the head starts from.
-        metadata: what the file said that the weights are from.
+        detection: settings of box decoding, initially `config.detection`; may be changed at any time.
+        anchors: the anchors of the head.
+        metadata: of the file that the weights were loaded from.
     """
 
     def __init__(self, config: PointPillarsConfig) -> None:
@@ -64,15 +64,15 @@ class PointPillars(nn.Module):
         self.neck = Neck(config)
         self.head = Head(config)
         self.heading_refiner = HeadingRefiner()
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster so
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster convolutions
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.pillars.linear.weight.device
 
     def encode(self, clouds: Sequence[Tensor]) -> Tensor:
-        """B clouds (N_i, 4) x, y, z [m], intensity, as a pseudo-image (B, pillar_channels, rows, columns).
+        """Encode B clouds (N_i, 4) x, y, z [m], intensity as a pseudo-image (B, pillar_channels, rows, columns).
 
         Points out of range or not finite are dropped; a cloud may be empty.
         """
@@ -81,84 +81,88 @@ class PointPillars(nn.Module):
         return image
 
     def multiscale(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The pseudo-image as three maps at strides 2, 4 and 8: what agents share."""
+        """Feature maps of the pseudo-image at strides 2, 4 and 8, which agents share."""
         maps: tuple[Tensor, Tensor, Tensor] = self.backbone(image)
         return maps
 
     def decode_features(self, maps: Sequence[Tensor]) -> HeadOutput:
-        """What the head says of three maps, one agent's or fused."""
+        """Output of the head for three maps, of one agent or fused."""
         output: HeadOutput = self.head(self.neck(maps))
         return output
 
     def forward(self, clouds: Sequence[Tensor]) -> HeadOutput:
-        """What the head says of B clouds (N_i, 4) x, y, z [m], intensity."""
+        """Output of the head for B clouds (N_i, 4) x, y, z [m], intensity."""
         return self.decode_features(self.multiscale(self.encode(clouds)))
 
-    def boxes(self, output: HeadOutput) -> list[Found]:
-        """The detections of each cloud, best first."""
+    def boxes(self, output: HeadOutput) -> list[Detections]:
+        """Decode the detections of each cloud, by descending score."""
         return decode(output, self.anchors, self.detection)
 
-    def refine_headings(self, found: Found, points: Float32Array) -> Found:
-        """Detections in a cloud (N, 4) after heading refinement, if `detection.heading_refinement` is set."""
-        return refine_headings(found, points, self.heading_refiner) if self.detection.heading_refinement else found
+    def refine_headings(self, detections: Detections, points: Float32Array) -> Detections:
+        """Refine the headings of detections in a cloud (N, 4), if `detection.heading_refinement` is set."""
+        return (
+            refine_headings(detections, points, self.heading_refiner)
+            if self.detection.heading_refinement
+            else detections
+        )
 
     def detect(self, points: ArrayLike) -> Boxes:
-        """The vehicles in one cloud.
+        """Detect the vehicles in one cloud.
 
         Args:
             points: (N, 4) x, y, z [m], intensity, in the LiDAR's frame. Rows with NaN are dropped. Clouds of sensors
                 at unusual heights are normalised first (`estimate_height_correction`).
 
         Returns:
-            Boxes in the LiDAR's frame, best first, with score and label.
+            Boxes in the LiDAR's frame, by descending score, with score and label.
 
         Raises:
-            ValueError: `points` is not numbers of shape (N, 4).
+            ValueError: `points` is not numeric of shape (N, 4).
         """
         return self.detect_batch([points])[0]
 
     def detect_batch(self, clouds: Sequence[ArrayLike]) -> list[Boxes]:
-        """The vehicles in each of several clouds, see `detect`."""
-        return [found.boxes for found in self._detect(clouds)]
+        """Detect the vehicles in each of several clouds; see `detect`."""
+        return [detections.boxes for detections in self._detect(clouds)]
 
     def detect_with_uncertainty(self, points: ArrayLike) -> tuple[Boxes, FloatArray]:
-        """The K vehicles in one cloud, and the (K, 3) variance of x, y [m^2] and yaw [rad^2] of each."""
-        found = self._detect([points])[0]
-        return found.boxes, found.variance
+        """Detect the K vehicles in one cloud, with the (K, 3) variance of x, y [m^2] and yaw [rad^2] of each."""
+        detections = self._detect([points])[0]
+        return detections.boxes, detections.variance
 
     @torch.inference_mode()
-    def _detect(self, clouds: Sequence[ArrayLike]) -> list[Found]:
+    def _detect(self, clouds: Sequence[ArrayLike]) -> list[Detections]:
         if not clouds:
             return []
         checked = [check_points(points) for points in clouds]
         offsets = [estimate_height_correction(points) for points in checked]
         normalised = [correct_height(points, z) for points, z in zip(checked, offsets, strict=True)]
-        with self._evaluating():
-            found = self.boxes(self([torch.from_numpy(points) for points in normalised]))
-            found = [self.refine_headings(one, points) for one, points in zip(found, normalised, strict=True)]
+        with self._evaluation_mode():
+            decoded = self.boxes(self([torch.from_numpy(points) for points in normalised]))
+            refined = [self.refine_headings(one, points) for one, points in zip(decoded, normalised, strict=True)]
         return [
             one._replace(boxes=one.boxes.replace(center=one.boxes.center - (0.0, 0.0, z)))
-            for one, z in zip(found, offsets, strict=True)
+            for one, z in zip(refined, offsets, strict=True)
         ]
 
     def save(self, path: str | Path, metadata: Mapping[str, Any] | None = None, half: bool = False) -> None:
-        """Write settings, weights and metadata (as JSON can hold it) to one safetensors file.
+        """Write settings, weights and metadata atomically to one safetensors file.
 
         Args:
-            path: where to; the file appears complete or not at all.
-            metadata: data, metrics, seed, whatever should be known of the weights.
-            half: in float16, for half the size.
+            path: of the file.
+            metadata: data, metrics, seed and the like, JSON-serialisable.
+            half: store weights as float16, for half the size.
         """
         config = json.loads(self.config.model_dump_json())
         save_checkpoint(path, _ARCHITECTURE, config, self, {**self.metadata, **(metadata or {})}, half)
 
     @classmethod
     def load(cls, path: str | Path) -> PointPillars:
-        """The detector that `save` wrote, on the CPU and ready to detect.
+        """Load a detector written by `save`, on the CPU and in evaluation mode.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, not ours, or of another format, network or shape; says which.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is damaged, not a checkpoint of CoBEVGlue, or of another format, network or shape.
         """
         checkpoint = load_checkpoint(path, _ARCHITECTURE)
         try:
@@ -172,10 +176,10 @@ class PointPillars(nn.Module):
 
     @classmethod
     def pretrained(cls, name: str) -> PointPillars:
-        """The detector of this name that comes with the package.
+        """Load a shipped detector by name.
 
         Raises:
-            ValueError: there is none; names the nearest.
+            ValueError: unknown name; the message suggests the most similar one.
         """
         names = sorted(path.stem for path in _WEIGHTS.glob("*.safetensors"))
         if name not in names:
@@ -186,7 +190,7 @@ class PointPillars(nn.Module):
 
     @classmethod
     def named(cls, name_or_file: str) -> PointPillars:
-        """The detector of this name that comes with the package, or the one in this `.safetensors` file.
+        """Load a shipped detector by name, or a detector from a `.safetensors` file.
 
         Raises:
             ValueError, FileNotFoundError: see `pretrained` and `load`.
@@ -194,18 +198,18 @@ class PointPillars(nn.Module):
         return cls.load(name_or_file) if name_or_file.endswith(".safetensors") else cls.pretrained(name_or_file)
 
     def export_onnx(self, path: str | Path) -> None:
-        """Write everything behind the pillars as an ONNX model: pseudo-images in, what the head says out.
+        """Export the network after the pillar encoder as an ONNX model, from pseudo-image to head output.
 
-        Input `image` (B, pillar_channels, rows, columns), B free; outputs as named in `HeadOutput`. Grouping points
-        into pillars has no counterpart in ONNX that is worth it: that stays `encode`, and what follows stays `boxes`.
+        Input `image` (B, pillar_channels, rows, columns) with dynamic B; outputs as named in `HeadOutput`. Pillar
+        encoding (`encode`) and decoding (`boxes`) are not part of the model.
         """
         shape = 1, self.config.pillar_channels, self.config.rows, self.config.columns
         names = list(HeadOutput._fields)
-        with self._evaluating(), warnings.catch_warnings():
-            # The exporter that takes this one's place needs onnxscript, for the same graph.
+        with self._evaluation_mode(), warnings.catch_warnings():
+            # The newer exporter needs onnxscript and gives the same graph.
             warnings.simplefilter("ignore", DeprecationWarning)
             torch.onnx.export(
-                _BehindPillars(self).eval(),
+                _DenseNetwork(self).eval(),
                 (torch.zeros(shape, device=self.device),),
                 str(path),
                 input_names=["image"],
@@ -216,8 +220,8 @@ class PointPillars(nn.Module):
             )
 
     @contextmanager
-    def _evaluating(self) -> Iterator[None]:
-        """Evaluation mode for a while, whatever the mode was."""
+    def _evaluation_mode(self) -> Iterator[None]:
+        """Switch to evaluation mode, and restore the mode on exit."""
         training = self.training
         if training:
             self.eval()
@@ -228,7 +232,7 @@ class PointPillars(nn.Module):
                 self.train()
 
 
-class _BehindPillars(nn.Module):
+class _DenseNetwork(nn.Module):
     def __init__(self, detector: PointPillars) -> None:
         super().__init__()
         self.detector = detector
@@ -238,10 +242,10 @@ class _BehindPillars(nn.Module):
 
 
 def check_points(points: ArrayLike) -> Float32Array:
-    """The valid returns of a point cloud, in float32.
+    """Convert a point cloud to float32 and drop invalid returns.
 
-    Dropped are points with a coordinate that is not finite, and points at exactly (0, 0, 0), as which several LiDAR
-    drivers store missing returns. An intensity that is not finite becomes 0.
+    These are points with non-finite coordinates, and points at exactly (0, 0, 0), as which several LiDAR drivers store
+    missing returns. A non-finite intensity is replaced by 0.
 
     Args:
         points: (N, 4) x, y, z [m], intensity, in the LiDAR frame.
@@ -250,7 +254,7 @@ def check_points(points: ArrayLike) -> Float32Array:
         (M, 4) with M <= N, in the same order.
 
     Raises:
-        ValueError: not numbers, or of another shape; says what it is instead.
+        ValueError: not numeric, or of another shape.
     """
     try:
         array = np.asarray(points)
@@ -262,7 +266,7 @@ def check_points(points: ArrayLike) -> Float32Array:
         array = array.reshape(0, 4)
     if array.ndim != 2 or array.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4): x, y, z [m], intensity; got {array.shape}")
-    with np.errstate(over="ignore"):  # what is too large for float32 is out of range too
+    with np.errstate(over="ignore"):  # values too large for float32 become infinite and are dropped
         cloud = np.array(array, dtype=np.float32, order="C")
     cloud[~np.isfinite(cloud[:, 3]), 3] = 0.0
     valid: Float32Array = cloud[np.isfinite(cloud[:, :3]).all(axis=1) & (cloud[:, :3] != 0.0).any(axis=1)]
