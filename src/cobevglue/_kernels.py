@@ -18,7 +18,13 @@ import numba
 
 __all__ = ["KERNEL_FILES", "kernel"]
 
-KERNEL_FILES = ("_iou_kernels.py", "alignment/evidence.py", "alignment/pose_filter.py", "alignment/pose_search.py")
+KERNEL_FILES = (
+    "_iou_kernels.py",
+    "alignment/evidence.py",
+    "alignment/pose_filter.py",
+    "alignment/pose_search.py",
+    "alignment/track_motion.py",
+)
 """The files that define kernels, relative to the package."""
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
