@@ -26,9 +26,9 @@ def package(tmp_path: Path) -> Path:
     copy.mkdir()
     (copy / "__init__.py").write_text("")
     source = (PACKAGE / "_kernels.py").read_text()
-    files = ", ".join(f'"{name}"' for name in KERNEL_FILES)
+    files = "".join(f'    "{name}",\n' for name in KERNEL_FILES)
     assert files in source
-    (copy / "_kernels.py").write_text(source.replace(files, '"small_kernels.py", "small_factor.py"'))
+    (copy / "_kernels.py").write_text(source.replace(files, '    "small_kernels.py",\n    "small_factor.py",\n'))
     (copy / "small_factor.py").write_text(INLINED.format(factor=2))
     (copy / "small_kernels.py").write_text(KERNEL)
     return copy

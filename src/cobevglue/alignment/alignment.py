@@ -26,6 +26,13 @@ class Alignment:
         evidence: how much speaks for the pose [nats], and
         margin: by how much that exceeds what speaks for the best different pose [nats]; NaN where an aligner
             measures neither.
+        time_offset: how much later than the ego's boxes the other's list shows the world [s]; -0.1: it is 0.1 s old.
+            `ego_SE2_other` has both frames at the ego's instant.
+        time_offset_std: its standard deviation [s]; that of the prior where nothing moves, NaN where the offset is not
+            estimated.
+        ego_SE2_list: the pose of the other's frame at the instant of its list, in the ego frame at the ego's instant;
+            by this pose, features and what stands still are warped. None for `ego_SE2_other` itself.
+        other_velocity: (N, 2) velocity over ground of the other's boxes along the axes of its frame [m/s]; None for 0.
     """
 
     ego_SE2_other: SE2 | None
@@ -34,6 +41,10 @@ class Alignment:
     reason: str = ""
     evidence: float = np.nan
     margin: float = np.nan
+    time_offset: float = 0.0
+    time_offset_std: float = np.nan
+    ego_SE2_list: SE2 | None = None
+    other_velocity: FloatArray | None = None
 
     @classmethod
     def refused(cls, reason: str, evidence: float = np.nan, margin: float = np.nan) -> Alignment:
@@ -44,6 +55,25 @@ class Alignment:
     def accepted(self) -> bool:
         """Whether there is a pose to use."""
         return self.ego_SE2_other is not None
+
+    def boxes_at_ego_instant(self, other: Boxes) -> Boxes:
+        """The other's boxes in the ego frame at the ego's instant: moved by their velocity and the time offset.
+
+        Args:
+            other: the N boxes that were aligned, in the other's frame.
+
+        Raises:
+            ValueError: the alignment was refused, or `other` has another number of rows.
+        """
+        if self.ego_SE2_other is None:
+            raise ValueError(f"no pose: {self.reason}")
+        if self.other_velocity is not None:
+            if len(other) != len(self.other_velocity):
+                raise ValueError(f"other has {len(other)} boxes, {len(self.other_velocity)} were aligned")
+            center = other.center.copy()
+            center[:, :2] -= self.time_offset * self.other_velocity
+            other = other.replace(center=center)
+        return other.transform(self.ego_SE2_list or self.ego_SE2_other)
 
 
 class Aligner(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 from types import ModuleType
 
 import numpy as np
@@ -22,6 +23,8 @@ __all__ = ["BEVGlue"]
 
 _FRAME = 0.1
 """Time between frames when none is given [s]."""
+_SAME_CLOCK = 1.0
+"""Time stamps that differ by more are of different clocks [s]."""
 
 
 class BEVGlue:
@@ -43,12 +46,14 @@ class BEVGlue:
             _PaperMatcher(self.config) if self.config.method == "affinity" else _EvidenceMatcher(self.config)
         )
         self._clock = Clock(_FRAME)
+        self._other_time: float | None = None
 
     def align(
         self,
         ego: Boxes,
         other: Boxes,
         time: float | None = None,
+        other_time: float | None = None,
         *,
         ego_body: Boxes | None = None,
         other_body: Boxes | None = None,
@@ -61,9 +66,15 @@ class BEVGlue:
         Args:
             ego: boxes in ego's frame, with track ids if there are any.
             other: the collaborator's boxes in its own frame.
-            time: when both were seen [s], on any clock; 0.1 s after the last call by default.
+            time: of the ego's boxes [s], on any clock; 0.1 s after the last call by default.
+            other_time: the collaborator's own time stamp of its list [s], on the same clock or another one; `time` by
+                default. If the two clocks differ by more than a second, only the steps of `other_time` are used.
             ego_body: one-row box of the ego's own vehicle in the ego frame, if it is known.
             other_body: one-row box of the collaborator's own vehicle in its own frame, as it transmits it.
+
+        With `BEVGlueConfig(time_offset=True)` the list of the collaborator may be of another instant: the offset is
+        estimated from the velocities of its tracks, and the pose is that at the ego's instant. Without, the two lists
+        are taken to be of one instant.
 
         Returns:
             The pose with the matches of `ego` and `other`; matches of own vehicles are not listed.
@@ -78,12 +89,19 @@ class BEVGlue:
                 raise TypeError(f"{name} must be Boxes, got {type(boxes).__name__}")
         with_bodies = append_body(ego, ego_body, "ego_body"), append_body(other, other_body, "other_body")
         two_vehicles = ego_body is not None and other_body is not None
-        alignment = self._matcher.align(*with_bodies, self._advance_clock(time), last_differ=two_vehicles)
+        dt = self._advance_clock(time)
+        other_dt, stamps = self._advance_other_clock(dt, other_time)
+        if not self.config.time_offset:
+            stamps = 0.0
+        alignment = self._matcher.align(
+            *with_bodies, dt, other_dt, stamps, last_differ=two_vehicles, other_body=other_body is not None
+        )
         return check_bodies(alignment, ego, other, ego_body, other_body)
 
     def reset(self) -> None:
         """Forget all frames."""
         self._clock.reset()
+        self._other_time = None
         self._matcher.reset()
 
     def _advance_clock(self, time: float | None) -> float:
@@ -94,6 +112,17 @@ class BEVGlue:
             self._matcher.reset()
             return _FRAME
         return step
+
+    def _advance_other_clock(self, dt: float, other_time: float | None) -> tuple[float, float]:
+        """Seconds between the collaborator's last list and this one, and its stamp minus the ego's (0 if unknown)."""
+        before, self._other_time = self._other_time, other_time
+        if other_time is None:
+            return dt, 0.0
+        if not math.isfinite(other_time):
+            raise ValueError(f"other_time must be finite, got {other_time}")
+        stamps = other_time - (self._clock.time or 0.0)
+        step = dt if before is None else max(other_time - before, 0.0)
+        return step, stamps if abs(stamps) <= _SAME_CLOCK else 0.0
 
 
 class _PaperMatcher:
@@ -106,7 +135,9 @@ class _PaperMatcher:
     def reset(self) -> None:
         self._track_pairs: IntArray = np.zeros((0, 2), np.int64)
 
-    def align(self, ego: Boxes, other: Boxes, dt: float, last_differ: bool) -> Alignment:
+    def align(
+        self, ego: Boxes, other: Boxes, dt: float, other_dt: float, stamps: float, last_differ: bool, other_body: bool
+    ) -> Alignment:
         ego_graph, other_graph = ObjectGraph.of(ego), ObjectGraph.of(other)
         carried = surviving_pairs(ego_graph, other_graph, self._track_pairs)
         pairs, confidence = common_subgraph(
@@ -151,6 +182,8 @@ class _EvidenceMatcher:
             config.link_distance,
             config.link_angle,
             config.tracks,
+            config.offset_std if config.time_offset else 0.0,
+            config.offset_drift if config.time_offset else 0.0,
         )
         self._rounds = config.rounds if config.refit else 0
         self.reset()
@@ -158,18 +191,27 @@ class _EvidenceMatcher:
     def reset(self) -> None:
         self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
         self._seen = 0
+        self._stamps = 0.0
+        self._motion_of_other = _OtherMotion(self._config)
 
-    def align(self, ego: Boxes, other: Boxes, dt: float, last_differ: bool) -> Alignment:
+    def align(
+        self, ego: Boxes, other: Boxes, dt: float, other_dt: float, stamps: float, last_differ: bool, other_body: bool
+    ) -> Alignment:
         if not self._config.temporal:
             self.reset()
-        self._hypotheses, margin, landing_std, pairs, x, y, yaw, covariance = self._kernels.advance(
+        other_rows, other_ids = _bev_rows(other), _NO_IDS if other.track_id is None else other.track_id
+        motion = self._motion_of_other
+        motion.follow(other_rows, other_ids, other_dt, other_body)
+        self._hypotheses, margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
             self._hypotheses,
             _bev_rows(ego),
-            _bev_rows(other),
+            other_rows,
             _NO_IDS if ego.track_id is None else ego.track_id,
-            _NO_IDS if other.track_id is None else other.track_id,
+            other_ids,
             last_differ,
             dt,
+            stamps,
+            self._stamps,
             self._seen,
             self._noise,
             self._motion,
@@ -177,6 +219,7 @@ class _EvidenceMatcher:
             self._rounds,
         )
         self._seen += 1
+        self._stamps = stamps
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0)
         evidence = float(self._hypotheses[0]["evidence"])
@@ -184,7 +227,15 @@ class _EvidenceMatcher:
         reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
         if reason:
             return Alignment.refused(reason, evidence, margin)
-        return Alignment(SE2(x, y, yaw), pairs, covariance, "", evidence, margin)
+        ego_SE2_list = SE2(x, y, yaw)
+        ego_SE2_other, covariance = motion.at_ego_instant(ego_SE2_list, offset, covariance)
+        velocity = other_rows[: len(other) - other_body, 5:]
+        offset_std = (
+            math.sqrt(max(float(self._hypotheses[0]["cov"][6, 6]), 0.0)) if self._config.time_offset else np.nan
+        )
+        return Alignment(
+            ego_SE2_other, pairs, covariance, "", evidence, margin, offset, offset_std, ego_SE2_list, velocity
+        )
 
     def _doubt(self, pairs: int, choices: int, evidence: float, margin: float, landing_std: float) -> str:
         """Why the best pose should not be trusted, or an empty string."""
@@ -203,13 +254,62 @@ class _EvidenceMatcher:
         return ""
 
 
+class _OtherMotion:
+    """Velocities of the other agent's tracks and of its frame, from its lists."""
+
+    def __init__(self, config: BEVGlueConfig) -> None:
+        track_motion: ModuleType = import_module("cobevglue.alignment.track_motion")  # untyped, as all kernels
+
+        self._follow = track_motion.follow_tracks if config.time_offset else None
+        self._noise = track_motion.TrackNoise()
+        self._tracks = np.zeros(0, track_motion.TRACK)
+        self._twist = np.zeros(3)
+        self._twist_variance = np.array([self._noise.frame_speed**2] * 2 + [self._noise.frame_turn**2])
+
+    def follow(self, rows: FloatArray, ids: IntArray, dt: float, own_body: bool) -> None:
+        """Write the velocities over ground into the last two columns of `rows` (N, 7).
+
+        The own vehicle, the last row, does not move in its own frame: over ground it moves against the twist.
+        """
+        if self._follow is None or dt <= 0.0:
+            return
+        n = len(rows) - own_body
+        self._tracks, self._twist, self._twist_variance, motion = self._follow(
+            self._tracks, self._twist, self._twist_variance, rows[:n], ids[:n], dt, self._noise
+        )
+        squared = (motion[:, :2] ** 2).sum(axis=1)
+        # Shrunk towards 0 by their uncertainty, so that the noise of what stands still does not count as motion.
+        shrinkage = np.maximum(0.0, 1.0 - _SHRINKAGE * motion[:, 2] / np.maximum(squared, 1e-9))
+        rows[:n, 5:] = motion[:, :2] * shrinkage[:, None]
+        if own_body and len(ids):
+            vx, vy, turn = self._twist
+            rows[n, 5:] = -(vx - turn * rows[n, 1]), -(vy + turn * rows[n, 0])
+
+    def at_ego_instant(self, ego_SE2_list: SE2, offset: float, covariance: FloatArray) -> tuple[SE2, FloatArray]:
+        """The pose with other's frame at the ego's instant, and its (3, 3) covariance.
+
+        Args:
+            ego_SE2_list: with other's frame at the instant of its list.
+            offset: time offset of the list [s].
+            covariance: (4, 4) of x, y, yaw and the offset.
+        """
+        shift = self._twist * offset
+        half = SE2(0.0, 0.0, 0.5 * shift[2]).rotation @ shift[:2]
+        jacobian = np.eye(3, 4)
+        jacobian[:2, 3] = ego_SE2_list.rotation @ self._twist[:2]
+        jacobian[2, 3] = self._twist[2]
+        return ego_SE2_list @ SE2(half[0], half[1], shift[2]), jacobian @ covariance @ jacobian.T
+
+
+_SHRINKAGE = 4.0
+"""A speed below the root of this many variances counts as 0."""
 _NO_IDS = np.zeros(0, np.int64)
 _NO_IDS.setflags(write=False)  # like the arrays of `Boxes`: numba compiles for one kind of array only
 
 
 def _bev_rows(boxes: Boxes) -> FloatArray:
-    """(N, 5) x, y, length, width, yaw, as the kernels take them (`Boxes.bev`, but without its cost)."""
-    rows = np.empty((len(boxes), 5))
+    """(N, 7) x, y, length, width, yaw and a velocity of 0, as the kernels take them."""
+    rows = np.zeros((len(boxes), 7))
     rows[:, :2] = boxes.center[:, :2]
     rows[:, 2:4] = boxes.size[:, :2]
     rows[:, 4] = boxes.yaw

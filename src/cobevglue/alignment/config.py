@@ -61,6 +61,8 @@ class BEVGlueConfig(Settings):
         refit: a star is refitted to all its pairs and matched again, instead of keeping its seed's pose.
         temporal: hypotheses are carried from frame to frame; otherwise every frame stands alone.
         tracks: a hypothesis also follows the track pairs it matched before (where both lists have track ids).
+        time_offset: every hypothesis has the time offset of other's list as one more unknown (needs other's track ids).
+            Off by default: the offsets are plausible, but more wrong poses are accepted (docs/benchmarks.md).
         verdict: doubtful poses are refused; otherwise the best pose is always accepted.
         position_std: of each component of the distance between two agents' detections of one object [m].
         heading_std: of the difference of their headings [rad]; a quarter of them differ several times more.
@@ -73,6 +75,8 @@ class BEVGlueConfig(Settings):
         yaw_acceleration: process noise of the relative yaw rate [rad/s^2 per sqrt(Hz)].
         speed_std: prior of the relative velocity [m/s].
         yaw_rate_std: prior of the relative yaw rate [rad/s].
+        offset_std: prior of the time offset, beyond the difference of the two time stamps where both are given [s].
+        offset_drift: process noise of the time offset [s per sqrt(s)].
         correlation: how many frames in a row share their detection errors: measurements count that much less.
         memory: weight of the evidence so far after 0.1 s.
         miss_memory: the same after 0.1 s in which nothing agreed with the hypothesis.
@@ -102,6 +106,7 @@ class BEVGlueConfig(Settings):
     refit: bool = True
     temporal: bool = True
     tracks: bool = True
+    time_offset: bool = False
     verdict: bool = True
 
     position_std: _Positive = 0.6
@@ -116,6 +121,8 @@ class BEVGlueConfig(Settings):
     yaw_acceleration: _Positive = 0.15
     speed_std: _Positive = 15.0
     yaw_rate_std: _Positive = 0.3
+    offset_std: _Positive = 0.15
+    offset_drift: _NotNegative = 0.02
     correlation: _Positive = 3.0
     memory: _Share = 0.92
     miss_memory: _Share = 0.6

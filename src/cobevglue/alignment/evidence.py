@@ -6,7 +6,8 @@ replaces the thresholded affinities of the paper (section 4.2, phi_V and phi_E; 
 is not public): a node's affinity becomes `size_evidence`, an edge's becomes `pair_evidence`, and the size of a common
 subgraph becomes the sum of both over its nodes, so that five vague agreements do not outvote four exact ones.
 
-Box rows here are (x, y, length, width, yaw) in metres and radians, each list in its own agent's frame.
+Box rows here are (x, y, length, width, yaw) in metres and radians, each list in its own agent's frame; those of the
+other agent are followed by the velocity over ground (vx, vy) along the axes of its frame in m/s.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from cobevglue._kernels import kernel
 from cobevglue.typing import FloatArray
 
-X, Y, LENGTH, WIDTH, YAW = range(5)
+X, Y, LENGTH, WIDTH, YAW, VX, VY = range(7)
 
 _SQRT_2PI = math.sqrt(2.0 * math.pi)
 _HEADING_TAIL_SHARE, _HEADING_TAIL_WIDTH = 0.25, 3.5

@@ -2,9 +2,9 @@
 
 A single frame with two common objects rarely has one answer; a second of frames nearly always has. So the filter
 keeps several hypotheses at once, each a relative pose with its rate of change (Kalman filter, constant velocity at
-the pivot), and the evidence it has gathered. In every frame each hypothesis looks for its common subgraph anew, from
-where motion and the surviving track pairs say it should be, and the full `search` runs beside them, so that a wrong
-lock is left as soon as another pose explains the frames better.
+the pivot), the time offset of the other agent's lists, and the evidence it has gathered. In every frame each
+hypothesis looks for its common subgraph anew, from where motion and the surviving track pairs say it should be, and
+the full `search` runs beside them, so that a wrong lock is left as soon as another pose explains the frames better.
 
 The evidence of a hypothesis is a running mean of its stars' evidence, old frames counting less. It starts as if one
 frame without any evidence had been seen before: the first frame alone counts half.
@@ -56,7 +56,8 @@ HYPOTHESIS = np.dtype(
         ("other_y", "f8"),
         ("yaw", "f8"),
         ("rate", "f8", (3,)),  # of ego_x, ego_y, yaw, with the pivot held still in other's frame [m/s, rad/s]
-        ("cov", "f8", (6, 6)),  # of (ego_x, ego_y, yaw, rate)
+        ("offset", "f8"),  # how much later other's list shows the world than ego's [s]
+        ("cov", "f8", (7, 7)),  # of (ego_x, ego_y, yaw, rate, offset)
         ("evidence", "f8"),  # running mean [nats]
         ("frame_evidence", "f8"),  # this frame's [nats], 0 when nothing agreed
         ("frames", "i8"),  # frames in which something agreed
@@ -82,14 +83,16 @@ class Motion(NamedTuple):
     link_distance: float
     link_angle: float
     use_tracks: bool
+    offset_std: float
+    offset_drift: float
 
 
 @kernel(error_model="numpy")
 def _mix(cov, i: int, k: int, factor: float) -> None:
     """What adding `factor` times component k to component i of the state does to its covariance."""
-    for j in range(6):
+    for j in range(7):
         cov[i, j] += factor * cov[k, j]
-    for j in range(6):
+    for j in range(7):
         cov[j, i] += factor * cov[j, k]
 
 
@@ -117,6 +120,7 @@ def _predict(h, dt: float, motion: Motion) -> None:
         h.cov[i, i + 3] += q * dt**2 / 2.0
         h.cov[i + 3, i] += q * dt**2 / 2.0
         h.cov[i + 3, i + 3] += q * dt
+    h.cov[6, 6] += motion.offset_drift**2 * dt
 
 
 @kernel(error_model="numpy")
@@ -137,14 +141,27 @@ def _move_pivot(h, other_x: float, other_y: float) -> None:
 
 @kernel(error_model="numpy")
 def _correct(h, star, correlation) -> None:
-    """Kalman update with a refitted star: at its pivot x, y and yaw are measured independently, one after another."""
+    """Kalman update with a refitted star: four independent measurements, one after another.
+
+    The offset from the differences of velocities, then x, y and yaw at the pivot, each as a linear function of itself
+    and the offset.
+    """
     _move_pivot(h, star.other_x, star.other_y)
-    cov, row = h.cov, np.empty(6)
-    innovation, variance = np.empty(3), np.empty(3)
-    innovation[0], innovation[1] = star.ego_x - h.ego_x, star.ego_y - h.ego_y
-    innovation[2] = wrap(star.yaw - h.yaw)
+    cos, sin = math.cos(h.yaw), math.sin(h.yaw)
+    cov, row = h.cov, np.empty(7)
+    innovation, variance, per_offset = np.empty(4), np.empty(4), np.empty(4)
+    ahead = star.offset - h.offset
+    per_offset[0] = -(cos * star.other_vx - sin * star.other_vy)
+    per_offset[1] = -(sin * star.other_vx + cos * star.other_vy)
+    per_offset[2] = star.yaw_per_offset
+    per_offset[3] = 0.0
+    innovation[0] = star.ego_x - h.ego_x + per_offset[0] * ahead
+    innovation[1] = star.ego_y - h.ego_y + per_offset[1] * ahead
+    innovation[2] = wrap(star.yaw - h.yaw + per_offset[2] * ahead)
+    innovation[3] = star.measured_offset - h.offset
     variance[0] = variance[1] = star.position_variance * correlation
-    variance[2] = star.yaw_variance * correlation
+    variance[2] = (star.yaw_variance - star.yaw_per_offset**2 * star.offset_variance) * correlation
+    variance[3] = star.measured_offset_variance * correlation
     surprise = 0.0
     for i in range(3):
         surprise += innovation[i] ** 2 / (cov[i, i] + variance[i]) / 3.0
@@ -154,21 +171,29 @@ def _correct(h, star, correlation) -> None:
         for i in range(6):
             for j in range(6):
                 cov[i, j] *= surprise / _SURPRISE
-    change = np.zeros(6)
-    for i in range(3):
-        left = innovation[i] - change[i]
-        for j in range(6):
-            row[j] = cov[i, j]
-        for j in range(6):
-            gain = row[j] / (row[i] + variance[i])
+        for i in range(6):
+            cov[i, 6] *= math.sqrt(surprise / _SURPRISE)
+            cov[6, i] = cov[i, 6]
+    change = np.zeros(7)
+    for i in (3, 0, 1, 2):
+        if i == 3 and not (cov[6, 6] > 0.0 and variance[3] < np.inf):
+            continue
+        state = 6 if i == 3 else i
+        left = innovation[i] - change[state] - per_offset[i] * change[6]
+        for j in range(7):
+            row[j] = cov[state, j] + per_offset[i] * cov[6, j]
+        total = row[state] + per_offset[i] * row[6] + variance[i]
+        for j in range(7):
+            gain = row[j] / total
             change[j] += gain * left
-            for k in range(6):
+            for k in range(7):
                 cov[j, k] -= gain * row[k]
     h.ego_x += change[0]
     h.ego_y += change[1]
     h.yaw = wrap(h.yaw + change[2])
     for j in range(3):
         h.rate[j] += change[3 + j]
+    h.offset += change[6]
 
 
 @kernel(error_model="numpy")
@@ -176,8 +201,8 @@ def _start(h, star, motion) -> None:
     """Begin anew at a refitted star's pose; nothing is known of its rate."""
     h.ego_x, h.ego_y, h.other_x, h.other_y = star.ego_x, star.ego_y, star.other_x, star.other_y
     h.yaw = wrap(star.yaw)
-    for i in range(6):
-        for j in range(6):
+    for i in range(7):
+        for j in range(7):
             h.cov[i, j] = 0.0
     for i in range(3):
         h.rate[i] = 0.0
@@ -186,6 +211,24 @@ def _start(h, star, motion) -> None:
         h.cov[i + 3, i + 3] = motion.speed_std**2
     h.cov[2, 2] = star.yaw_variance * motion.correlation
     h.cov[5, 5] = motion.yaw_rate_std**2
+    h.offset, h.cov[6, 6] = star.offset, star.offset_variance
+    # Where the offset is wrong, so is the pose: x = x0 + R v (offset - offset0).
+    cos, sin = math.cos(h.yaw), math.sin(h.yaw)
+    _mix(h.cov, 0, 6, cos * star.other_vx - sin * star.other_vy)
+    _mix(h.cov, 1, 6, sin * star.other_vx + cos * star.other_vy)
+
+
+@kernel(error_model="numpy")
+def _set_offset(h, star) -> None:
+    """Give a star the time offset of a hypothesis as prior, and the dependence of the pose on it."""
+    star.offset = star.prior_offset = h.offset
+    star.offset_variance = star.prior_offset_variance = h.cov[6, 6]
+    star.other_vx = star.other_vy = 0.0
+    if h.cov[6, 6] > 0.0:
+        x, y = h.cov[0, 6] / h.cov[6, 6], h.cov[1, 6] / h.cov[6, 6]
+        cos, sin = math.cos(h.yaw), math.sin(h.yaw)
+        star.other_vx, star.other_vy = cos * x + sin * y, cos * y - sin * x
+        star.position_variance = max(0.0, star.position_variance - 0.5 * (x * x + y * y) * h.cov[6, 6])
 
 
 @kernel(error_model="numpy")
@@ -194,6 +237,7 @@ def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:
     star.ego_x, star.ego_y, star.other_x, star.other_y, star.yaw = h.ego_x, h.ego_y, h.other_x, h.other_y, h.yaw
     star.position_variance = 0.5 * (h.cov[0, 0] + h.cov[1, 1])
     star.yaw_variance = h.cov[2, 2]
+    _set_offset(h, star)
     refine(ego, other, sizes, star, pairs, noise, rounds)
 
 
@@ -226,17 +270,17 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
 
 @kernel(error_model="numpy")
 def _at_origin(h):
-    """x, y, yaw and their (3, 3) covariance at the origin of other's frame instead of the pivot."""
+    """x, y, yaw and the (4, 4) covariance of them and the offset, at the origin of other's frame."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
     rx, ry = cos * h.other_x - sin * h.other_y, sin * h.other_x + cos * h.other_y
-    covariance = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            covariance[i, j] = h.cov[i, j]
+    covariance = np.empty((4, 4))
+    for i in range(4):
+        for j in range(4):
+            covariance[i, j] = h.cov[i if i < 3 else 6, j if j < 3 else 6]
     for i, factor in ((0, ry), (1, -rx)):
-        for j in range(3):
+        for j in range(4):
             covariance[i, j] += factor * covariance[2, j]
-        for j in range(3):
+        for j in range(4):
             covariance[j, i] += factor * covariance[j, 2]
     return h.ego_x - rx, h.ego_y - ry, h.yaw, covariance
 
@@ -252,17 +296,21 @@ def _landing_std(h, other) -> float:
 
 
 @kernel(error_model="numpy")
-def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, motion, tries, rounds):
+def advance(
+    old, ego, other, ego_ids, other_ids, last_differ, dt, stamps, stamps_before, seen, noise, motion, tries, rounds
+):
     """One frame: predict, follow, search, link, update.
 
     Args:
         old: (H,) `HYPOTHESIS` records of the last frame, best first; overwritten.
         ego: (M, 5) boxes.
-        other: (N, 5) boxes.
+        other: (N, 7) boxes.
         ego_ids: (M,) track ids, or (0,) when there are none.
         other_ids: (N,) likewise.
         last_differ: whether the last boxes of both are known to be different objects, the agents' own vehicles.
         dt: seconds since the last frame.
+        stamps: time stamp of other's list minus that of ego's, 0 if it has none: the prior of the offset [s].
+        stamps_before: the same in the last frame [s].
         seen: frames seen before this one.
         noise: the noise model.
         motion: the motion model.
@@ -272,7 +320,8 @@ def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, m
     Returns:
         The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the
         standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
-        of ego and other that it matches in this frame; and its x, y and yaw with their (3, 3) covariance.
+        of ego and other that it matches in this frame; its x, y and yaw at the instants of the two lists and the time
+        offset, and the (4, 4) covariance of these four.
     """
     steps = dt / _STEP
     memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
@@ -291,8 +340,9 @@ def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, m
         sizes[len(ego) - 1, len(other) - 1] = -_IMPOSSIBLE
     for i in range(before):
         _predict(old[i], dt, motion)
+        old[i].offset += stamps - stamps_before
     if len(ego) > 0 and len(other) > 0:
-        count = search(ego, other, sizes, noise, tries, rounds, stars, rows)
+        count = search(ego, other, sizes, noise, stamps, motion.offset_std**2, tries, rounds, stars, rows)
         for i in range(before):
             _follow(old[i], ego, other, sizes, star, pairs, noise, rounds)
             if star.pairs > 0:
@@ -315,6 +365,7 @@ def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, m
             star.pairs = _surviving_pairs(h, ego_ids, other_ids, pairs)
             if star.pairs >= 2:
                 star.yaw = h.yaw
+                _set_offset(h, star)
                 fit_pose(ego, other, star, pairs, noise)
                 for s in range(count):
                     if (
@@ -367,8 +418,8 @@ def advance(old, ego, other, ego_ids, other_ids, last_differ, dt, seen, noise, m
     if len(matched):
         copy_pairs(matched, rows[best_star], len(matched))
     if len(ranked) == 0:
-        return ranked, margin, np.inf, matched, 0.0, 0.0, 0.0, np.zeros((3, 3))
+        return ranked, margin, np.inf, matched, 0.0, 0.0, 0.0, 0.0, np.zeros((4, 4))
     best_hypothesis = ranked[0]
     landing = _landing_std(best_hypothesis, other)
     x, y, yaw, covariance = _at_origin(best_hypothesis)
-    return ranked, margin, landing, matched, x, y, yaw, covariance
+    return ranked, margin, landing, matched, x, y, yaw, best_hypothesis.offset, covariance

@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from cobevglue._kernels import kernel
-from cobevglue.alignment.evidence import YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
+from cobevglue.alignment.evidence import VX, VY, YAW, NoiseModel, X, Y, pair_evidence, wrap, wrap_half_turn
 from cobevglue.typing import FloatArray, IntArray
 
 __all__ = [
@@ -48,6 +48,18 @@ STAR = np.dtype(
         ("yaw", "f8"),
         ("position_variance", "f8"),  # of ego_x and of ego_y [m^2]
         ("yaw_variance", "f8"),  # [rad^2]
+        (
+            "other_vx",
+            "f8",
+        ),  # velocity of the pivot in other's frame, by which the pose depends on the time offset [m/s]
+        ("other_vy", "f8"),
+        ("offset", "f8"),  # time offset of other's list [s] and its variance [s^2] ...
+        ("offset_variance", "f8"),
+        ("prior_offset", "f8"),  # ... before any pair was matched ...
+        ("prior_offset_variance", "f8"),
+        ("measured_offset", "f8"),  # ... and from the pairs alone
+        ("measured_offset_variance", "f8"),
+        ("yaw_per_offset", "f8"),  # how the fitted yaw changes with the assumed offset, negated [rad/s]
         ("evidence", "f8"),  # of all its pairs [nats]
         ("pairs", "i8"),  # how many; which ones stand in an array of row numbers beside the record
     ],
@@ -88,11 +100,12 @@ def most_pairs(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> int:
 def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     """Find the pairs that agree with a star's pose, one-to-one, best evidence first.
 
-    The tolerance grows with the distance from the pivot, as far as the star's yaw is uncertain.
+    The tolerance grows with the distance from the pivot, as far as the star's yaw is uncertain, and along the velocity
+    of a moving box, as far as the time offset is.
 
     Args:
         ego: (M, 5) boxes.
-        other: (N, 5) boxes.
+        other: (N, 7) boxes.
         sizes: (M, N) from `size_evidence`.
         star: a `STAR` record; its pose is read, its evidence and number of pairs are written.
         pairs: (>= `most_pairs`, 2) rows of ego and other, written.
@@ -104,18 +117,27 @@ def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     row = np.empty((len(gain), 2), np.int64)
     found = 0
     for n in range(n_count):
-        dx, dy = other[n, X] - star.other_x, other[n, Y] - star.other_y
+        dx = other[n, X] - star.offset * other[n, VX] - star.other_x
+        dy = other[n, Y] - star.offset * other[n, VY] - star.other_y
         x, y = star.ego_x + cos * dx - sin * dy, star.ego_y + sin * dx + cos * dy
+        ux, uy = other[n, VX] - star.other_vx, other[n, VY] - star.other_vy
+        vx, vy = cos * ux - sin * uy, sin * ux + cos * uy
         variance = noise.position_std**2 + star.position_variance
         if noise.use_range_tolerance:
             variance += (dx * dx + dy * dy) * star.yaw_variance
-        reach = _GATE * _GATE * variance
+        # Variance is rank one in addition: offset_variance v v^T, inverted by Sherman and Morrison.
+        variance_along = variance + star.offset_variance * (vx * vx + vy * vy)
+        share, spread = star.offset_variance / variance_along, math.sqrt(variance * variance_along)
+        reach = _GATE * _GATE * variance_along
         for m in range(m_count):
             ex, ey = ego[m, X] - x, ego[m, Y] - y
             squared = ex * ex + ey * ey
-            if squared < reach and found < len(gain):
+            if squared >= reach:
+                continue
+            squared = (squared - share * (ex * vx + ey * vy) ** 2) * spread / variance
+            if squared < _GATE * _GATE * spread and found < len(gain):
                 heading = ego[m, YAW] - other[n, YAW] - star.yaw
-                evidence = pair_evidence(squared, heading, variance, noise) + sizes[m, n]
+                evidence = pair_evidence(squared, heading, spread, noise) + sizes[m, n]
                 if evidence > 0.0:
                     place = found
                     while place > 0 and gain[place - 1] < evidence:
@@ -156,22 +178,27 @@ def fit_pose(ego, other, star, pairs, noise) -> None:
 
     In the plane the SVD of the paper reduces to one arctangent. Headings count modulo pi around the star's yaw, as
     measurements of direction with a robust weight; with few or close centres they decide, with many they hardly
-    matter. Writes the pivot, the yaw and both variances.
+    matter. Other's boxes are moved by the time offset; where they have different velocities, one Gauss-Newton step
+    fits yaw and offset together, the latter with its prior. Writes the pivot, the yaw, the offset and the variances.
     """
     k = star.pairs
-    ex = ey = ox = oy = 0.0
+    ex = ey = ox = oy = ux = uy = 0.0
     for i in range(k):
-        ex += ego[pairs[i, 0], X] / k
-        ey += ego[pairs[i, 0], Y] / k
-        ox += other[pairs[i, 1], X] / k
-        oy += other[pairs[i, 1], Y] / k
+        m, n = pairs[i, 0], pairs[i, 1]
+        ex += ego[m, X] / k
+        ey += ego[m, Y] / k
+        ox += other[n, X] / k
+        oy += other[n, Y] / k
+        ux += other[n, VX] / k
+        uy += other[n, VY] / k
     variance = noise.position_std**2
     heading_variance = (noise.heading_std / _HEADING_WEIGHT) ** 2
     c = s = information = 0.0
     for i in range(k):
         m, n = pairs[i, 0], pairs[i, 1]
         ax, ay = ego[m, X] - ex, ego[m, Y] - ey
-        bx, by = other[n, X] - ox, other[n, Y] - oy
+        bx = other[n, X] - ox - star.offset * (other[n, VX] - ux)
+        by = other[n, Y] - oy - star.offset * (other[n, VY] - uy)
         c += (bx * ax + by * ay) / variance
         s += (bx * ay - by * ax) / variance
         information += (bx * bx + by * by) / variance
@@ -181,10 +208,34 @@ def fit_pose(ego, other, star, pairs, noise) -> None:
         c += weight * math.cos(star.yaw + turn)
         s += weight * math.sin(star.yaw + turn)
         information += weight
-    star.ego_x, star.ego_y, star.other_x, star.other_y = ex, ey, ox, oy
     star.yaw = math.atan2(s, c)
+
+    cos, sin = math.cos(star.yaw), math.sin(star.yaw)
+    offset_information = mixed = pull = 0.0
+    for i in range(k):
+        m, n = pairs[i, 0], pairs[i, 1]
+        ux_n, uy_n = other[n, VX] - ux, other[n, VY] - uy
+        bx, by = other[n, X] - ox - star.offset * ux_n, other[n, Y] - oy - star.offset * uy_n
+        ax, ay = ego[m, X] - ex, ego[m, Y] - ey
+        rx, ry = cos * ax + sin * ay - bx, cos * ay - sin * ax - by  # the residual along other's axes
+        offset_information += (ux_n * ux_n + uy_n * uy_n) / variance
+        mixed += (by * ux_n - bx * uy_n) / variance
+        pull -= (rx * ux_n + ry * uy_n) / variance
+    star.yaw_per_offset = mixed / information
+    offset_information -= mixed * mixed / information  # of the offset with an unknown yaw
+    star.measured_offset, star.measured_offset_variance = star.offset, np.inf
+    if star.prior_offset_variance > 0.0 and offset_information > 1e-9:
+        star.measured_offset += pull / offset_information
+        star.measured_offset_variance = 1.0 / offset_information
+        gain = star.prior_offset_variance / (star.prior_offset_variance + star.measured_offset_variance)
+        offset = star.prior_offset + gain * (star.measured_offset - star.prior_offset)
+        star.yaw -= star.yaw_per_offset * (offset - star.offset)
+        star.offset = offset
+        star.offset_variance = gain * star.measured_offset_variance
+    star.ego_x, star.ego_y, star.other_vx, star.other_vy = ex, ey, ux, uy
+    star.other_x, star.other_y = ox - star.offset * ux, oy - star.offset * uy
     star.position_variance = variance / k
-    star.yaw_variance = 1.0 / information
+    star.yaw_variance = 1.0 / information + star.yaw_per_offset**2 * star.offset_variance
 
 
 @kernel(error_model="numpy")
@@ -317,7 +368,7 @@ def _directions(boxes):
 
 
 @kernel(error_model="numpy")
-def _score_seeds(ego, other, sizes, noise):
+def _score_seeds(ego, other, sizes, noise, offset, offset_variance):
     """Every seed's rough evidence: (S,) scores and (S, 3) ego row, other row, flipped."""
     m_count, n_count = len(ego), len(other)
     seed_rows = _seed_rows(sizes)
@@ -344,8 +395,9 @@ def _score_seeds(ego, other, sizes, noise):
         _smallest(gap, leaf_rows)
         for i in range(leaves):
             q = leaf_rows[i]
-            dx[i], dy[i] = other[q, X] - other[n, X], other[q, Y] - other[n, Y]
-            variance = noise.position_std**2
+            ux, uy = other[q, VX] - other[n, VX], other[q, VY] - other[n, VY]
+            dx[i], dy[i] = other[q, X] - other[n, X] - offset * ux, other[q, Y] - other[n, Y] - offset * uy
+            variance = noise.position_std**2 + 0.5 * offset_variance * (ux * ux + uy * uy)
             if noise.use_range_tolerance:
                 variance += (dx[i] ** 2 + dy[i] ** 2) * _SEED_HEADING_STD**2
             constant[i] = heading_gain - math.log(2.0 * math.pi * variance * noise.density)
@@ -387,14 +439,16 @@ def _score_seeds(ego, other, sizes, noise):
 
 
 @kernel(error_model="numpy")
-def search(ego, other, sizes, noise, tries, rounds, stars, rows):
+def search(ego, other, sizes, noise, offset, offset_variance, tries, rounds, stars, rows):
     """Find the best stars of one pair of frames, no two of them with the same pose.
 
     Args:
         ego: (M, 5) boxes, at least one.
-        other: (N, 5) boxes, at least one.
+        other: (N, 7) boxes, at least one.
         sizes: (M, N) from `size_evidence`.
         noise: the noise model.
+        offset: prior of the time offset of other's list [s].
+        offset_variance: its variance [s^2]; 0 for a known offset.
         tries: seeds refined at most.
         rounds: refits of each.
         stars: (> tries,) `STAR` records, written from the first on; the last one is scratch.
@@ -403,7 +457,7 @@ def search(ego, other, sizes, noise, tries, rounds, stars, rows):
     Returns:
         How many were found.
     """
-    score, seed = _score_seeds(ego, other, sizes, noise)
+    score, seed = _score_seeds(ego, other, sizes, noise, offset, offset_variance)
     star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
     partner = np.empty(len(ego), np.int64)
     for m in range(len(ego)):
@@ -418,7 +472,11 @@ def search(ego, other, sizes, noise, tries, rounds, stars, rows):
             break
         score[best] = -np.inf
         m, n = seed[best, 0], seed[best, 1]
-        star.ego_x, star.ego_y, star.other_x, star.other_y = ego[m, X], ego[m, Y], other[n, X], other[n, Y]
+        star.offset = star.prior_offset = offset
+        star.offset_variance = star.prior_offset_variance = offset_variance
+        star.other_vx, star.other_vy = other[n, VX], other[n, VY]
+        star.ego_x, star.ego_y = ego[m, X], ego[m, Y]
+        star.other_x, star.other_y = other[n, X] - offset * star.other_vx, other[n, Y] - offset * star.other_vy
         star.yaw = ego[m, YAW] - other[n, YAW] + math.pi * seed[best, 2]
         star.position_variance, star.yaw_variance = 0.0, _SEED_HEADING_STD**2
         refine(ego, other, sizes, star, pairs, noise, rounds)

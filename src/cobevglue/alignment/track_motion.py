@@ -38,6 +38,8 @@ _ROUNDS = 4
 """Refits of the frame's motion, each with weights from the residuals of the last."""
 _MOST_AGE = 0.5
 """A track without detections ends after this time [s]."""
+_TURN_TIME = 3.0
+"""Time after which the turn rate of a vehicle is another one [s]."""
 _OTHER_OBJECT = 25.0
 """Squared innovation, in variances, above which a track id is another object now."""
 
@@ -49,9 +51,9 @@ class TrackNoise(NamedTuple):
     acceleration: float = 3.0  # of an object [m/s^2]
     speed: float = 10.0  # prior of an object [m/s]
     frame_speed: float = 20.0  # prior of the frame [m/s]
-    frame_turn: float = 0.5  # prior of the frame [rad/s]
-    frame_acceleration: float = 6.0  # [m/s^2]
-    frame_turn_acceleration: float = 0.6  # [rad/s^2]
+    frame_turn: float = 0.3  # prior of the frame [rad/s]
+    frame_acceleration: float = 4.0  # [m/s^2]
+    frame_turn_acceleration: float = 0.4  # [rad/s^2]
 
 
 @kernel(error_model="numpy")
@@ -155,7 +157,7 @@ def follow_tracks(old, twist, twist_variance, boxes, ids, dt, noise):
     expected, prior = np.empty(3), np.empty(3)
     for i in range(3):
         q = (noise.frame_acceleration if i < 2 else noise.frame_turn_acceleration) ** 2
-        expected[i] = dt * twist[i]
+        expected[i] = dt * twist[i] * (1.0 if i < 2 else math.exp(-dt / _TURN_TIME))
         prior[i] = dt * dt * (twist_variance[i] + q * dt * dt)
     motion, motion_variance = _fit_frame_motion(before, now, variance, expected, prior, count)
 

@@ -54,6 +54,7 @@ class PairFrame:
         ego_body: one-row box of the ego's own vehicle in the ego frame, or None.
         other_body: likewise of the other agent, in its own frame.
         time: of the frame [s]; None for 0.1 s after the previous one.
+        time_offset: the true time offset of the other's list [s]; NaN if unknown.
     """
 
     ego: Boxes
@@ -64,6 +65,7 @@ class PairFrame:
     ego_body: Boxes | None = None
     other_body: Boxes | None = None
     time: float | None = None
+    time_offset: float = math.nan
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,7 +78,10 @@ class AlignmentSequence:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Result of an aligner in one frame. Errors are infinite if it refused; `seconds` is the duration of the call."""
+    """Result of an aligner in one frame. Errors are infinite if it refused; `seconds` is the duration of the call.
+
+    `time_offset_error` [s] is NaN if it refused or the true offset is unknown.
+    """
 
     sequence: str
     co_visible: int
@@ -88,6 +93,7 @@ class Record:
     found_matches: int
     possible_matches: int
     seconds: float
+    time_offset_error: float = math.nan
 
     @property
     def right(self) -> bool:
@@ -147,6 +153,7 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
                 len(alignment.matches) if frame.pairs is not None else 0,
                 possible if alignment.accepted else 0,
                 seconds,
+                abs(alignment.time_offset - frame.time_offset) if alignment.accepted else math.nan,
             )
 
 

@@ -10,6 +10,7 @@ import csv
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -183,7 +184,7 @@ def _detected(labels: Boxes, detections: Boxes) -> IntArray:
 
 
 def noisy_label_sequences(
-    dataset: Dataset, errors: DetectionErrors, seed: int = 0, max_range: float = math.inf
+    dataset: Dataset, errors: DetectionErrors, seed: int = 0, max_range: float = math.inf, late: int = 0
 ) -> Iterator[AlignmentSequence]:
     """Sequences of every pair of agents of every scenario: labels with detection errors, tracked.
 
@@ -192,6 +193,7 @@ def noisy_label_sequences(
         errors: model of the detection errors.
         seed: of the errors.
         max_range: objects farther from an agent are not detected [m].
+        late: the other agent's list is this many frames old; the true pose is that at the ego's instant.
     """
     for index, scenario in enumerate(dataset):
         names = sorted({name for frame in scenario for name in frame.agents})
@@ -201,9 +203,10 @@ def noisy_label_sequences(
         for a, b in itertools.combinations(range(len(names)), 2):
             frames = []
             for i, frame in enumerate(scenario):
-                if i in detected[a] and i in detected[b]:
+                if i in detected[a] and i in detected[b] and i - late in detected[b]:
                     ego, other = frame.agents[names[a]], frame.agents[names[b]]
-                    frames.append(_pair_frame(detected[a][i], ego, detected[b][i], other))
+                    pair = _pair_frame(detected[a][i], ego, detected[b][i - late], other)
+                    frames.append(replace(pair, time_offset=-_FRAME * late))
             yield AlignmentSequence(f"{scenario.name}/{names[a]}-{names[b]}", frames)
 
 
