@@ -130,14 +130,15 @@ def late(data: Path) -> Table:
 
 
 def offset(data: Path) -> Table:
-    """V2V4Real with the time offset estimated or not, in a made-up moving frame and in the cars' own frames."""
+    """V2V4Real with the time offset estimated or not, in a made-up frame and in the cars' own frames."""
     print("## V2V4Real train, time offset estimated or not (wrong: boxes land 3 m or more off)\n")
     table: Table = []
     folder, cars = data / "v2v4real_detections", data / "v2v4real_cars.csv"
     for estimated in (False, True):
         config = BEVGlueConfig(time_offset=estimated)
         for what, sequences in (
-            ("any frame", real_cars(data, V2V4REAL_TRAIN)),
+            ("constant frame", real_cars(data, V2V4REAL_TRAIN, moving=False)),
+            ("moving frame", real_cars(data, V2V4REAL_TRAIN)),
             ("own frames, with bodies", v2v4real_car_sequences(folder, cars, V2V4REAL_TRAIN, bodies=True)),
         ):
             records = run(sequences, lambda c=config: BEVGlue(c))  # type: ignore[misc]
@@ -198,9 +199,11 @@ def ablation(data: Path) -> Table:
     return table
 
 
-def real_cars(data: Path, names: tuple[str, ...], seeds: tuple[int, ...] = SEEDS) -> list[AlignmentSequence]:
-    """The recorded sequences, once for each drive of the other car's frame."""
-    return [s for seed in seeds for s in v2v4real_sequences(data / "v2v4real_detections", names, seed)]
+def real_cars(
+    data: Path, names: tuple[str, ...], seeds: tuple[int, ...] = SEEDS, moving: bool = True
+) -> list[AlignmentSequence]:
+    """The recorded sequences, once for each trajectory of the other car's frame."""
+    return [s for seed in seeds for s in v2v4real_sequences(data / "v2v4real_detections", names, seed, moving=moving)]
 
 
 def noisy_labels(data: Path, reach: float, late: int = 0) -> list[AlignmentSequence]:

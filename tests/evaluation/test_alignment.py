@@ -138,6 +138,13 @@ def test_the_stored_identity_of_recorded_detections_is_hidden() -> None:
 
 
 @needs_data
+def test_a_frame_can_stay_at_its_first_pose() -> None:
+    (moving,) = v2v4real_sequences(DATA / "v2v4real_detections", ("val/0004",))
+    (constant,) = v2v4real_sequences(DATA / "v2v4real_detections", ("val/0004",), moving=False)
+    assert {frame.ego_SE2_other for frame in constant.frames} == {moving.frames[0].ego_SE2_other}
+
+
+@needs_data
 @pytest.mark.parametrize(
     ("name", "least"),
     [("val/0004", 0.95), ("val/0008", 0.95), ("train/0006", 0.9)],  # many co-visible objects, moderate, few

@@ -74,7 +74,7 @@ def smooth_trajectory(seed: int, frames: int) -> list[SE2]:
 
 
 def v2v4real_sequences(
-    root: Path, names: tuple[str, ...], seed: int = 0, min_score: float = 0.0
+    root: Path, names: tuple[str, ...], seed: int = 0, min_score: float = 0.0, moving: bool = True
 ) -> list[AlignmentSequence]:
     """Recorded PointPillars detections of two real cars.
 
@@ -83,17 +83,21 @@ def v2v4real_sequences(
         names: such as "val/0004".
         seed: of the trajectory of other's frame.
         min_score: detections with lower scores are dropped before tracking.
+        moving: other's frame moves along the trajectory; otherwise it stays at its first pose. The stored lists are not
+            of one instant: only in a frame that stays does a list that is late in the world look late.
     """
-    return [_v2v4real_sequence(root, name, seed, min_score) for name in names]
+    return [_v2v4real_sequence(root, name, seed, min_score, moving) for name in names]
 
 
-def _v2v4real_sequence(root: Path, name: str, seed: int, min_score: float) -> AlignmentSequence:
+def _v2v4real_sequence(root: Path, name: str, seed: int, min_score: float, moving: bool) -> AlignmentSequence:
     split, number = name.split("/")
     files = [root / split / side / f"{number}.txt" for side in ("ego", "other", "labels")]
     n = count_frames(*files)
     ego_boxes, other_boxes = (read_v2v4real_detections(file, n) for file in files[:2])
     labels = read_v2v4real_labels(files[2], n)
     trajectory = smooth_trajectory(seed * 1000 + int(number) + 100 * (split == "val"), n)
+    if not moving:
+        trajectory = trajectory[:1] * n
     ego_tracker, other_tracker = Sort(), Sort()
     frames = []
     for ego, other, label, ego_SE2_other in zip(ego_boxes, other_boxes, labels, trajectory, strict=True):
