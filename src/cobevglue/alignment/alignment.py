@@ -30,9 +30,9 @@ class Alignment:
             `ego_SE2_other` has both frames at the ego's instant.
         time_offset_std: its standard deviation [s]; that of the prior where nothing moves, NaN where the offset is not
             estimated.
-        ego_SE2_list: the pose of the other's frame at the instant of its list, in the ego frame at the ego's instant;
-            by this pose, features and what stands still are warped. None for `ego_SE2_other` itself.
-        other_velocity: (N, 2) velocity over ground of the other's boxes along the axes of its frame [m/s]; None for 0.
+        ego_SE2_list: the pose of the other's frame at the instant of its list, in the ego frame at the ego's instant:
+            by this pose features are warped. None for `ego_SE2_other` itself.
+        other_velocity: (N, 2) velocity of the other's boxes in its own, moving frame [m/s]; None for 0.
     """
 
     ego_SE2_other: SE2 | None
@@ -73,7 +73,7 @@ class Alignment:
             center = other.center.copy()
             center[:, :2] -= self.time_offset * self.other_velocity
             other = other.replace(center=center)
-        return other.transform(self.ego_SE2_list or self.ego_SE2_other)
+        return other.transform(self.ego_SE2_other)
 
 
 class Aligner(Protocol):

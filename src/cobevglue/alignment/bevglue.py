@@ -227,14 +227,20 @@ class _EvidenceMatcher:
         reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
         if reason:
             return Alignment.refused(reason, evidence, margin)
-        ego_SE2_list = SE2(x, y, yaw)
-        ego_SE2_other, covariance = motion.at_ego_instant(ego_SE2_list, offset, covariance)
-        velocity = other_rows[: len(other) - other_body, 5:]
-        offset_std = (
-            math.sqrt(max(float(self._hypotheses[0]["cov"][6, 6]), 0.0)) if self._config.time_offset else np.nan
-        )
+        pose = SE2(x, y, yaw)
+        if not self._config.time_offset:
+            return Alignment(pose, pairs, covariance[:3, :3], "", evidence, margin)
         return Alignment(
-            ego_SE2_other, pairs, covariance, "", evidence, margin, offset, offset_std, ego_SE2_list, velocity
+            pose,
+            pairs,
+            covariance[:3, :3],
+            "",
+            evidence,
+            margin,
+            time_offset=offset,
+            time_offset_std=math.sqrt(max(covariance[3, 3], 0.0)),
+            ego_SE2_list=motion.at_list_instant(pose, offset),
+            other_velocity=other_rows[: len(other) - other_body, 5:],
         )
 
     def _doubt(self, pairs: int, choices: int, evidence: float, margin: float, landing_std: float) -> str:
@@ -267,9 +273,10 @@ class _OtherMotion:
         self._twist_variance = np.array([self._noise.frame_speed**2] * 2 + [self._noise.frame_turn**2])
 
     def follow(self, rows: FloatArray, ids: IntArray, dt: float, own_body: bool) -> None:
-        """Write the velocities over ground into the last two columns of `rows` (N, 7).
+        """Write the velocities of the boxes in the other's own, moving frame into the last two columns of `rows` (N, 7).
 
-        The own vehicle, the last row, does not move in its own frame: over ground it moves against the twist.
+        Moved back by them, the boxes are those of the other's frame at the ego's instant. The own vehicle, the last
+        row, does not move in its own frame.
         """
         if self._follow is None or dt <= 0.0:
             return
@@ -280,28 +287,24 @@ class _OtherMotion:
         squared = (motion[:, :2] ** 2).sum(axis=1)
         # Shrunk towards 0 by their uncertainty, so that the noise of what stands still does not count as motion.
         shrinkage = np.maximum(0.0, 1.0 - _SHRINKAGE * motion[:, 2] / np.maximum(squared, 1e-9))
-        rows[:n, 5:] = motion[:, :2] * shrinkage[:, None]
-        if own_body and len(ids):
-            vx, vy, turn = self._twist
-            rows[n, 5:] = -(vx - turn * rows[n, 1]), -(vy + turn * rows[n, 0])
+        vx, vy, turn = self._twist
+        rows[:n, 5:] = motion[:, :2] * shrinkage[:, None] + [vx, vy]
+        rows[:n, 5] -= turn * rows[:n, 1]
+        rows[:n, 6] += turn * rows[:n, 0]
 
-    def at_ego_instant(self, ego_SE2_list: SE2, offset: float, covariance: FloatArray) -> tuple[SE2, FloatArray]:
-        """The pose with other's frame at the ego's instant, and its (3, 3) covariance.
+    def at_list_instant(self, ego_SE2_other: SE2, offset: float) -> SE2:
+        """The pose with the other's frame at the instant of its list.
 
         Args:
-            ego_SE2_list: with other's frame at the instant of its list.
+            ego_SE2_other: with the other's frame at the ego's instant.
             offset: time offset of the list [s].
-            covariance: (4, 4) of x, y, yaw and the offset.
         """
-        shift = self._twist * offset
+        shift = -offset * self._twist
         half = SE2(0.0, 0.0, 0.5 * shift[2]).rotation @ shift[:2]
-        jacobian = np.eye(3, 4)
-        jacobian[:2, 3] = ego_SE2_list.rotation @ self._twist[:2]
-        jacobian[2, 3] = self._twist[2]
-        return ego_SE2_list @ SE2(half[0], half[1], shift[2]), jacobian @ covariance @ jacobian.T
+        return ego_SE2_other @ SE2(half[0], half[1], shift[2])
 
 
-_SHRINKAGE = 4.0
+_SHRINKAGE = 9.0
 """A speed below the root of this many variances counts as 0."""
 _NO_IDS = np.zeros(0, np.int64)
 _NO_IDS.setflags(write=False)  # like the arrays of `Boxes`: numba compiles for one kind of array only

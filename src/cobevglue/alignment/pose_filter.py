@@ -184,10 +184,12 @@ def _correct(h, star, correlation) -> None:
             row[j] = cov[state, j] + per_offset[i] * cov[6, j]
         total = row[state] + per_offset[i] * row[6] + variance[i]
         for j in range(7):
-            gain = row[j] / total
+            # Velocities are noisy, so positions must not pull at the offset: it is a consider state (Schmidt-Kalman).
+            gain = row[j] / total if i == 3 or j < 6 else 0.0
             change[j] += gain * left
             for k in range(7):
-                cov[j, k] -= gain * row[k]
+                if i == 3 or j < 6 or k < 6:
+                    cov[j, k] -= row[j] / total * row[k]
     h.ego_x += change[0]
     h.ego_y += change[1]
     h.yaw = wrap(h.yaw + change[2])
@@ -394,7 +396,10 @@ def advance(
             _correct(h, stars[s], motion.correlation)
         else:
             _start(h, stars[s], motion)
-        h.evidence = memory * h.evidence + (1.0 - memory) * stars[s].evidence
+        evidence = stars[s].evidence
+        if motion.offset_std > 0.0:
+            evidence -= 0.5 * ((h.offset - stamps) / motion.offset_std) ** 2
+        h.evidence = memory * h.evidence + (1.0 - memory) * evidence
         _remember(h, stars[s], rows[s], ego_ids, other_ids)
 
     ranked = np.empty(min(total, _MOST_HYPOTHESES), HYPOTHESIS)

@@ -42,6 +42,12 @@ _TURN_TIME = 3.0
 """Time after which the turn rate of a vehicle is another one [s]."""
 _OTHER_OBJECT = 25.0
 """Squared innovation, in variances, above which a track id is another object now."""
+_FEWEST_ANCHORS = 3
+"""Tracks that it takes to tell the motion of the frame from theirs."""
+_WIDEST_SCALE, _NARROWEST_SCALE = 64.0, 4.0
+"""Squared velocity, in variances, at which a track counts a quarter in the common motion: first and last."""
+_ANCHOR_PRIOR = (5.0, 5.0, 0.3)
+"""Standard deviations of the common motion before the fit [m/s, m/s, rad/s]."""
 
 
 class TrackNoise(NamedTuple):
@@ -96,6 +102,54 @@ def _fit_frame_motion(before, now, variance, expected, prior, count):
             for j in range(3):
                 motion[i] += left[i, j] * pull[j]
     return motion, np.array([left[0, 0], left[1, 1], left[2, 2]])
+
+
+@kernel(error_model="numpy")
+def _fit_common_motion(tracks, count):
+    """The rigid motion (vx, vy, turn rate) that most of `count` tracks share over ground.
+
+    Graduated non-convexity with a Geman-McClure weight: the scale falls from all tracks to those within the noise, so
+    that the largest group that moves as one decides and not the mean of all.
+
+    Args:
+        tracks: `TRACK` records.
+        count: how many.
+
+    Returns:
+        Velocity at the origin and turn rate (3,); 0 for fewer than `_FEWEST_ANCHORS` tracks.
+    """
+    motion = np.zeros(3)
+    if count < _FEWEST_ANCHORS:
+        return motion
+    scale = _WIDEST_SCALE
+    while True:
+        hessian, pull = np.zeros((3, 3)), np.zeros(3)
+        for i in range(3):
+            hessian[i, i] = 1.0 / (_ANCHOR_PRIOR[i] * _ANCHOR_PRIOR[i])
+            pull[i] = -motion[i] * hessian[i, i]
+        for t in range(count):
+            x, y = tracks[t].x, tracks[t].y
+            ex = tracks[t].vx - motion[0] + motion[2] * y
+            ey = tracks[t].vy - motion[1] - motion[2] * x
+            variance = tracks[t].velocity_variance
+            weight = 1.0 / (1.0 + (ex * ex + ey * ey) / (scale * variance))
+            weight *= weight / variance
+            hessian[0, 0] += weight
+            hessian[1, 1] += weight
+            hessian[0, 2] -= weight * y
+            hessian[1, 2] += weight * x
+            hessian[2, 2] += weight * (x * x + y * y)
+            pull[0] += weight * ex
+            pull[1] += weight * ey
+            pull[2] += weight * (x * ey - y * ex)
+        hessian[2, 0], hessian[2, 1] = hessian[0, 2], hessian[1, 2]
+        left = np.linalg.inv(hessian)
+        for i in range(3):
+            for j in range(3):
+                motion[i] += left[i, j] * pull[j]
+        if scale <= _NARROWEST_SCALE:
+            return motion
+        scale *= 0.5
 
 
 @kernel(error_model="numpy")
@@ -199,4 +253,15 @@ def follow_tracks(old, twist, twist_variance, boxes, ids, dt, noise):
         if track.age <= _MOST_AGE:
             kept[total] = track
             total += 1
-    return kept[:total].copy(), motion / dt, motion_variance / (dt * dt), motion_of
+    twist = motion / dt
+    # What all tracks share is the motion of the frame, whichever of the two it was taken for so far.
+    common = _fit_common_motion(kept, total)
+    for i in range(3):
+        twist[i] += common[i]
+    for t in range(total):
+        kept[t].vx -= common[0] - common[2] * kept[t].y
+        kept[t].vy -= common[1] + common[2] * kept[t].x
+    for n in range(n_count):
+        motion_of[n, 0] -= common[0] - common[2] * boxes[n, Y]
+        motion_of[n, 1] -= common[1] + common[2] * boxes[n, X]
+    return kept[:total].copy(), twist, motion_variance / (dt * dt), motion_of
