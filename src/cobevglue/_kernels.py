@@ -20,6 +20,7 @@ __all__ = ["KERNEL_FILES", "kernel"]
 
 KERNEL_FILES = (
     "_iou_kernels.py",
+    "alignment/absence.py",
     "alignment/evidence.py",
     "alignment/pose_filter.py",
     "alignment/pose_search.py",

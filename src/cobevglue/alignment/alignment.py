@@ -26,6 +26,8 @@ class Alignment:
         evidence: how much speaks for the pose [nats], and
         margin: by how much that exceeds what speaks for the best different pose [nats]; NaN where an aligner
             measures neither.
+        risk: estimated probability that the pose lands boxes farther off than the tolerance; also of the best pose
+            when refused. NaN where an aligner does not estimate it.
         time_offset: how much later than the ego's boxes the other's list shows the world [s]; -0.1: it is 0.1 s old.
             `ego_SE2_other` has both frames at the ego's instant.
         time_offset_std: its standard deviation [s]; that of the prior where nothing moves, NaN where the offset is not
@@ -41,15 +43,16 @@ class Alignment:
     reason: str = ""
     evidence: float = np.nan
     margin: float = np.nan
+    risk: float = np.nan
     time_offset: float = 0.0
     time_offset_std: float = np.nan
     ego_SE2_list: SE2 | None = None
     other_velocity: FloatArray | None = None
 
     @classmethod
-    def refused(cls, reason: str, evidence: float = np.nan, margin: float = np.nan) -> Alignment:
+    def refused(cls, reason: str, evidence: float = np.nan, margin: float = np.nan, risk: float = np.nan) -> Alignment:
         """No pose, and why."""
-        return cls(None, reason=reason, evidence=evidence, margin=margin)
+        return cls(None, reason=reason, evidence=evidence, margin=margin, risk=risk)
 
     @property
     def accepted(self) -> bool:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from importlib import import_module
-from types import ModuleType
 
 import numpy as np
 
 from cobevglue.alignment.alignment import Alignment
-from cobevglue.alignment.common_subgraph import common_subgraph, surviving_pairs
 from cobevglue.alignment.config import BEVGlueConfig
-from cobevglue.alignment.object_graph import ObjectGraph
+from cobevglue.alignment.evidence_matcher import EvidenceMatcher, ListTimes
 from cobevglue.alignment.own_body import append_body, check_bodies
-from cobevglue.alignment.procrustes import procrustes
+from cobevglue.alignment.paper_matcher import PaperMatcher
 from cobevglue.boxes import Boxes
 from cobevglue.clock import Clock
 from cobevglue.se2 import SE2
-from cobevglue.typing import FloatArray, IntArray
+from cobevglue.typing import ArrayLike, FloatArray
 
 __all__ = ["BEVGlue"]
 
@@ -42,8 +39,8 @@ class BEVGlue:
     def __init__(self, config: BEVGlueConfig | None = None) -> None:
         """Start with nothing seen; the default settings are the robust variant."""
         self.config = config or BEVGlueConfig()
-        self._matcher = (
-            _PaperMatcher(self.config) if self.config.method == "affinity" else _EvidenceMatcher(self.config)
+        self._matcher: PaperMatcher | EvidenceMatcher = (
+            PaperMatcher(self.config) if self.config.method == "affinity" else EvidenceMatcher(self.config)
         )
         self._clock = Clock(_FRAME)
         self._other_time: float | None = None
@@ -57,6 +54,7 @@ class BEVGlue:
         *,
         ego_body: Boxes | None = None,
         other_body: Boxes | None = None,
+        prior: tuple[SE2, ArrayLike] | None = None,
     ) -> Alignment:
         """The relative pose in this frame, or a refusal with its reason.
 
@@ -71,31 +69,31 @@ class BEVGlue:
                 default. If the two clocks differ by more than a second, only the steps of `other_time` are used.
             ego_body: one-row box of the ego's own vehicle in the ego frame, if it is known.
             other_body: one-row box of the collaborator's own vehicle in its own frame, as it transmits it.
+            prior: a claimed ego_SE2_other, from GPS for example, and its (3, 3) covariance of x, y [m] and yaw [rad].
+                It is one more pose to try and counts as little evidence, so that a false claim does no harm.
 
-        With `BEVGlueConfig(time_offset=True)` the list of the collaborator may be of another instant: the offset is
-        estimated from the velocities of its tracks, and the pose is that at the ego's instant. Without, the two lists
-        are taken to be of one instant.
+        The list of the collaborator may be of another instant: the offset is estimated from the velocities of its
+        tracks, and the pose is that at the ego's instant. With `BEVGlueConfig(time_offset=False)` the two lists are
+        taken to be of one instant.
 
         Returns:
             The pose with the matches of `ego` and `other`; matches of own vehicles are not listed.
 
         Raises:
-            ValueError: `time` is not finite, not in seconds or not later than the last call's, or a body has not one
-                row.
+            ValueError: `time` is not finite, not in seconds or not later than the last call's, a body has not one row,
+                or the covariance of the prior is not positive definite.
             TypeError: a list is no `Boxes`.
         """
         for name, boxes in (("ego", ego), ("other", other)):
             if not isinstance(boxes, Boxes):
                 raise TypeError(f"{name} must be Boxes, got {type(boxes).__name__}")
         with_bodies = append_body(ego, ego_body, "ego_body"), append_body(other, other_body, "other_body")
-        two_vehicles = ego_body is not None and other_body is not None
-        dt = self._advance_clock(time)
-        other_dt, stamps = self._advance_other_clock(dt, other_time)
-        if not self.config.time_offset:
-            stamps = 0.0
-        alignment = self._matcher.align(
-            *with_bodies, dt, other_dt, stamps, last_differ=two_vehicles, other_body=other_body is not None
-        )
+        claimed = None if prior is None else (prior[0], _checked_covariance(prior[1]))
+        times = self._advance_clocks(time, other_time)
+        if isinstance(self._matcher, PaperMatcher):
+            alignment = self._matcher.align(*with_bodies)
+        else:
+            alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
         return check_bodies(alignment, ego, other, ego_body, other_body)
 
     def reset(self) -> None:
@@ -104,239 +102,29 @@ class BEVGlue:
         self._other_time = None
         self._matcher.reset()
 
-    def _advance_clock(self, time: float | None) -> float:
-        """Seconds since the last call; after a gap that is too long everything is forgotten."""
+    def _advance_clocks(self, time: float | None, other_time: float | None) -> ListTimes:
+        """Times of these lists; after a gap that is too long everything is forgotten."""
+        if other_time is not None and not math.isfinite(other_time):
+            raise ValueError(f"other_time must be finite, got {other_time}")
         first = self._clock.time is None
         step = self._clock.advance(time)
         if not first and step > self.config.max_gap:
             self._matcher.reset()
-            return _FRAME
-        return step
-
-    def _advance_other_clock(self, dt: float, other_time: float | None) -> tuple[float, float]:
-        """Seconds between the collaborator's last list and this one, and its stamp minus the ego's (0 if unknown)."""
+            step = _FRAME
         before, self._other_time = self._other_time, other_time
         if other_time is None:
-            return dt, 0.0
-        if not math.isfinite(other_time):
-            raise ValueError(f"other_time must be finite, got {other_time}")
-        stamps = other_time - (self._clock.time or 0.0)
-        step = dt if before is None else max(other_time - before, 0.0)
-        return step, stamps if abs(stamps) <= _SAME_CLOCK else 0.0
-
-
-class _PaperMatcher:
-    """The method as printed: graphs, temporally consistent maximum common subgraph, SVD."""
-
-    def __init__(self, config: BEVGlueConfig) -> None:
-        self._config = config
-        self.reset()
-
-    def reset(self) -> None:
-        self._track_pairs: IntArray = np.zeros((0, 2), np.int64)
-
-    def align(
-        self, ego: Boxes, other: Boxes, dt: float, other_dt: float, stamps: float, last_differ: bool, other_body: bool
-    ) -> Alignment:
-        ego_graph, other_graph = ObjectGraph.of(ego), ObjectGraph.of(other)
-        carried = surviving_pairs(ego_graph, other_graph, self._track_pairs)
-        pairs, confidence = common_subgraph(
-            ego_graph, other_graph, carried if len(carried) else None, self._config.affinity
-        )
-        if ego.track_id is not None and other.track_id is not None:
-            self._track_pairs = np.column_stack([ego.track_id[pairs[:, 0]], other.track_id[pairs[:, 1]]])
-        if len(pairs) < 2:
-            return Alignment.refused("fewer than two common objects: no rotation", evidence=confidence)
-        pose = procrustes(ego_graph.position[pairs[:, 0]], other_graph.position[pairs[:, 1]])
-        arms = pose.rotation @ other_graph.position[pairs[:, 1]].T
-        return Alignment(pose, pairs, _fit_covariance(arms, self._config.position_std), evidence=confidence)
-
-
-class _EvidenceMatcher:
-    """The robust variant: the best star by likelihood, hypotheses carried over time, a verdict."""
-
-    def __init__(self, config: BEVGlueConfig) -> None:
-        self._config = config
-        self._kernels = _load_kernels()
-        self._noise = self._kernels.NoiseModel(
-            config.position_std,
-            config.heading_std,
-            config.length_std,
-            config.width_std,
-            config.size_gain,
-            config.density,
-            config.flip_probability,
-            config.sizes,
-            config.heading_flips,
-            config.range_tolerance,
-            config.one_to_one,
-        )
-        self._motion = self._kernels.Motion(
-            config.acceleration,
-            config.yaw_acceleration,
-            config.speed_std,
-            config.yaw_rate_std,
-            config.correlation,
-            config.memory,
-            config.miss_memory,
-            config.link_distance,
-            config.link_angle,
-            config.tracks,
-            config.offset_std if config.time_offset else 0.0,
-            config.offset_drift if config.time_offset else 0.0,
-        )
-        self._rounds = config.rounds if config.refit else 0
-        self.reset()
-
-    def reset(self) -> None:
-        self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
-        self._seen = 0
-        self._stamps = 0.0
-        self._motion_of_other = _OtherMotion(self._config)
-
-    def align(
-        self, ego: Boxes, other: Boxes, dt: float, other_dt: float, stamps: float, last_differ: bool, other_body: bool
-    ) -> Alignment:
-        if not self._config.temporal:
-            self.reset()
-        other_rows, other_ids = _bev_rows(other), _NO_IDS if other.track_id is None else other.track_id
-        motion = self._motion_of_other
-        motion.follow(other_rows, other_ids, other_dt, other_body)
-        self._hypotheses, margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
-            self._hypotheses,
-            _bev_rows(ego),
-            other_rows,
-            _NO_IDS if ego.track_id is None else ego.track_id,
-            other_ids,
-            last_differ,
-            dt,
-            stamps,
-            self._stamps,
-            self._seen,
-            self._noise,
-            self._motion,
-            self._config.tries,
-            self._rounds,
-        )
-        self._seen += 1
-        self._stamps = stamps
-        if not len(self._hypotheses):
-            return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0)
-        evidence = float(self._hypotheses[0]["evidence"])
-        choices = len(ego) * len(other)
-        reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
-        if reason:
-            return Alignment.refused(reason, evidence, margin)
-        pose = SE2(x, y, yaw)
-        if not self._config.time_offset:
-            return Alignment(pose, pairs, covariance[:3, :3], "", evidence, margin)
-        return Alignment(
-            pose,
-            pairs,
-            covariance[:3, :3],
-            "",
-            evidence,
-            margin,
-            time_offset=offset,
-            time_offset_std=math.sqrt(max(covariance[3, 3], 0.0)),
-            ego_SE2_list=motion.at_list_instant(pose, offset),
-            other_velocity=other_rows[: len(other) - other_body, 5:],
+            return ListTimes(step, step)
+        stamp_difference = other_time - (self._clock.time or 0.0)
+        return ListTimes(
+            step,
+            step if before is None else max(other_time - before, 0.0),
+            stamp_difference if abs(stamp_difference) <= _SAME_CLOCK else 0.0,
         )
 
-    def _doubt(self, pairs: int, choices: int, evidence: float, margin: float, landing_std: float) -> str:
-        """Why the best pose should not be trusted, or an empty string."""
-        config = self._config
-        if pairs == 0:
-            return "no object in this frame supports the pose followed so far"
-        least = config.min_evidence + config.min_evidence_per_choice * math.log(max(choices / 25.0, 1.0))
-        if evidence < least:
-            return f"too few common objects: evidence {evidence:.1f} nats, {least:.1f} needed"
-        # One frame cannot tell a regular pattern from the same one shifted; frames in which things move can.
-        least = max(config.min_margin, config.min_relative_margin * (1.0 + 1.0 / self._seen) * evidence)
-        if margin < least:
-            return f"ambiguous: a different pose is only {margin:.1f} nats behind, {least:.1f} needed"
-        if landing_std > config.max_landing_std:
-            return f"too uncertain: boxes would land within {landing_std:.1f} m, {config.max_landing_std:.1f} m allowed"
-        return ""
 
-
-class _OtherMotion:
-    """Velocities of the other agent's tracks and of its frame, from its lists."""
-
-    def __init__(self, config: BEVGlueConfig) -> None:
-        track_motion: ModuleType = import_module("cobevglue.alignment.track_motion")  # untyped, as all kernels
-
-        self._follow = track_motion.follow_tracks if config.time_offset else None
-        self._noise = track_motion.TrackNoise()
-        self._tracks = np.zeros(0, track_motion.TRACK)
-        self._twist = np.zeros(3)
-        self._twist_variance = np.array([self._noise.frame_speed**2] * 2 + [self._noise.frame_turn**2])
-
-    def follow(self, rows: FloatArray, ids: IntArray, dt: float, own_body: bool) -> None:
-        """Write the velocities of the boxes in the other's own, moving frame into the last two columns of `rows` (N, 7).
-
-        Moved back by them, the boxes are those of the other's frame at the ego's instant. The own vehicle, the last
-        row, does not move in its own frame.
-        """
-        if self._follow is None or dt <= 0.0:
-            return
-        n = len(rows) - own_body
-        self._tracks, self._twist, self._twist_variance, motion = self._follow(
-            self._tracks, self._twist, self._twist_variance, rows[:n], ids[:n], dt, self._noise
-        )
-        squared = (motion[:, :2] ** 2).sum(axis=1)
-        # Shrunk towards 0 by their uncertainty, so that the noise of what stands still does not count as motion.
-        shrinkage = np.maximum(0.0, 1.0 - _SHRINKAGE * motion[:, 2] / np.maximum(squared, 1e-9))
-        vx, vy, turn = self._twist
-        rows[:n, 5:] = motion[:, :2] * shrinkage[:, None] + [vx, vy]
-        rows[:n, 5] -= turn * rows[:n, 1]
-        rows[:n, 6] += turn * rows[:n, 0]
-
-    def at_list_instant(self, ego_SE2_other: SE2, offset: float) -> SE2:
-        """The pose with the other's frame at the instant of its list.
-
-        Args:
-            ego_SE2_other: with the other's frame at the ego's instant.
-            offset: time offset of the list [s].
-        """
-        shift = -offset * self._twist
-        half = SE2(0.0, 0.0, 0.5 * shift[2]).rotation @ shift[:2]
-        return ego_SE2_other @ SE2(half[0], half[1], shift[2])
-
-
-_SHRINKAGE = 9.0
-"""A speed below the root of this many variances counts as 0."""
-_NO_IDS = np.zeros(0, np.int64)
-_NO_IDS.setflags(write=False)  # like the arrays of `Boxes`: numba compiles for one kind of array only
-
-
-def _bev_rows(boxes: Boxes) -> FloatArray:
-    """(N, 7) x, y, length, width, yaw and a velocity of 0, as the kernels take them."""
-    rows = np.zeros((len(boxes), 7))
-    rows[:, :2] = boxes.center[:, :2]
-    rows[:, 2:4] = boxes.size[:, :2]
-    rows[:, 4] = boxes.yaw
-    return rows
-
-
-def _nothing_in_common(ego: Boxes, other: Boxes) -> str:
-    if len(ego) == 0 or len(other) == 0:
-        return f"{'ego' if len(ego) == 0 else 'other'} sees no object"
-    return "no two boxes are similar enough to be one object"
-
-
-def _fit_covariance(arms: FloatArray, position_std: float) -> FloatArray:
-    """(3, 3) covariance of a least-squares pose from (2, K) rotated points with independent errors."""
-    k = arms.shape[1]
-    information = np.diag([float(k), float(k), float((arms**2).sum())])
-    information[0, 2] = information[2, 0] = -arms[1].sum()
-    information[1, 2] = information[2, 1] = arms[0].sum()
-    covariance: FloatArray = np.linalg.pinv(information) * position_std**2
-    return covariance
-
-
-def _load_kernels() -> ModuleType:
-    """Import the numba kernels: only here, because numba takes longer to import than everything else together."""
-    from cobevglue.alignment import pose_filter
-
-    return pose_filter
+def _checked_covariance(covariance: ArrayLike) -> FloatArray:
+    """The (3, 3) covariance of a claimed pose."""
+    checked = np.asarray(covariance, dtype=np.float64)
+    if checked.shape != (3, 3) or not np.isfinite(checked).all() or np.linalg.eigvalsh(checked).min() <= 0.0:
+        raise ValueError(f"prior: the covariance must be (3, 3) and positive definite, got {checked.tolist()}")
+    return checked

@@ -62,7 +62,6 @@ class BEVGlueConfig(Settings):
         temporal: hypotheses are carried from frame to frame; otherwise every frame stands alone.
         tracks: a hypothesis also follows the track pairs it matched before (where both lists have track ids).
         time_offset: every hypothesis has the time offset of other's list as one more unknown (needs other's track ids).
-            Off by default: the offsets are plausible, but more wrong poses are accepted (docs/benchmarks.md).
         verdict: doubtful poses are refused; otherwise the best pose is always accepted.
         position_std: of each component of the distance between two agents' detections of one object [m].
         heading_std: of the difference of their headings [rad]; a quarter of them differ several times more.
@@ -77,18 +76,16 @@ class BEVGlueConfig(Settings):
         yaw_rate_std: prior of the relative yaw rate [rad/s].
         offset_std: prior of the time offset, beyond the difference of the two time stamps where both are given [s].
         offset_drift: process noise of the time offset [s per sqrt(s)].
+        absence: evidence against a pose for each box that lies in the view of the other agent and has no counterpart
+            [nats].
         correlation: how many frames in a row share their detection errors: measurements count that much less.
         memory: weight of the evidence so far after 0.1 s.
         miss_memory: the same after 0.1 s in which nothing agreed with the hypothesis.
         link_distance: a star this near to a predicted pose (at its pivot) continues the hypothesis [m].
         link_angle: and this near in yaw [rad].
-        min_margin: accept only if the evidence exceeds that of the best different pose by this much [nats] ...
-        min_relative_margin: ... and by this share of itself, so that a long row of equal gaps stays ambiguous; by twice
-            this share in the first frame, 1.5 times in the second, and so on.
-        min_evidence: accept only above this evidence [nats]; one common object alone stays below it ...
-        min_evidence_per_choice: ... and above this much more for each factor e by which the pairs to choose from exceed
-            25, because the best of many chance agreements looks better than the best of few [nats].
-        max_landing_std: accept only if other's boxes land with less than this standard deviation on average [m].
+        chance_evidence: that the best pose of two agents with nothing in common reaches [nats].
+        tolerance: a pose is wrong if it lands boxes farther off than this [m].
+        risk: accept only if the estimated probability of a wrong pose is below this.
         tries: seeds that are refined in each frame.
         rounds: refits of each.
         max_gap: after this time without a call everything is forgotten [s].
@@ -106,7 +103,7 @@ class BEVGlueConfig(Settings):
     refit: bool = True
     temporal: bool = True
     tracks: bool = True
-    time_offset: bool = False
+    time_offset: bool = True
     verdict: bool = True
 
     position_std: _Positive = 0.6
@@ -123,17 +120,16 @@ class BEVGlueConfig(Settings):
     yaw_rate_std: _Positive = 0.3
     offset_std: _Positive = 0.15
     offset_drift: _NotNegative = 0.02
+    absence: _NotNegative = 1.0
     correlation: _Positive = 3.0
     memory: _Share = 0.92
     miss_memory: _Share = 0.6
     link_distance: _Positive = 3.0
     link_angle: _Positive = 0.15
 
-    min_margin: _NotNegative = 4.0
-    min_relative_margin: _NotNegative = 0.25
-    min_evidence: _NotNegative = 8.0
-    min_evidence_per_choice: _NotNegative = 5.0
-    max_landing_std: _Positive = 1.4
+    chance_evidence: _NotNegative = 6.0
+    tolerance: _Positive = 3.0
+    risk: _Share = 0.05
 
     tries: Annotated[int, Field(ge=1)] = 6
     rounds: Annotated[int, Field(ge=1)] = 2

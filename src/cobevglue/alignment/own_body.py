@@ -70,6 +70,6 @@ def check_bodies(
         return alignment
     if ego_body is not None and other_body is not None and bev_iou(ego_body, other_body.transform(pose))[0, 0] > 0.0:
         reason = "the pose places the two agents' own vehicles into each other"
-        return Alignment.refused(reason, alignment.evidence, alignment.margin)
+        return Alignment.refused(reason, alignment.evidence, alignment.margin, 1.0)
     listed = (alignment.matches < [len(ego), len(other)]).all(axis=1)
     return alignment if listed.all() else replace(alignment, matches=alignment.matches[listed])

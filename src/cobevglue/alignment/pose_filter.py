@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cobevglue._kernels import kernel
+from cobevglue.alignment.absence import missing_counterparts
 from cobevglue.alignment.evidence import NoiseModel, X, Y, size_evidence, wrap
 from cobevglue.alignment.pose_search import (
     SAME_ANGLE,
@@ -43,8 +44,12 @@ _SURPRISE = 2.0
 """Mean squared innovation, in standard deviations, above which a hypothesis' covariance is inflated."""
 _FEWEST_TO_OVERRULE = 4
 """Pairs that it takes for that."""
+_SAME_TURN_RATE = 9.0
+"""Squared difference of two estimates of a turn rate, in variances, above which one of them is wrong."""
 _IMPOSSIBLE = 1e6
 """Evidence against a pair that cannot be one object [nats]."""
+_CLAIM_EVIDENCE = 2.0
+"""Evidence of a claimed pose at most [nats]."""
 _STEP = 0.1
 """Memory is configured per frame of this length [s]."""
 
@@ -85,6 +90,7 @@ class Motion(NamedTuple):
     use_tracks: bool
     offset_std: float
     offset_drift: float
+    absence: float
 
 
 @kernel(error_model="numpy")
@@ -94,6 +100,14 @@ def _mix(cov, i: int, k: int, factor: float) -> None:
         cov[i, j] += factor * cov[k, j]
     for j in range(7):
         cov[j, i] += factor * cov[j, k]
+
+
+@kernel(error_model="numpy")
+def _symmetrise(cov) -> None:
+    """Remove what rounding leaves, which would grow from frame to frame."""
+    for i in range(7):
+        for j in range(i):
+            cov[i, j] = cov[j, i] = 0.5 * (cov[i, j] + cov[j, i])
 
 
 @kernel(error_model="numpy")
@@ -121,6 +135,33 @@ def _predict(h, dt: float, motion: Motion) -> None:
         h.cov[i + 3, i] += q * dt**2 / 2.0
         h.cov[i + 3, i + 3] += q * dt
     h.cov[6, 6] += motion.offset_drift**2 * dt
+
+
+@kernel(error_model="numpy")
+def _correct_turn_rate(h, turn_rate, variance) -> None:
+    """Kalman update with the relative turn rate that the two frames' motions imply, unless it contradicts the pose's.
+
+    The velocities of the frames are not used: where most of what an agent sees drives along with it, the two agents
+    may take different things for the ground.
+    """
+    total = h.cov[5, 5] + variance
+    innovation = turn_rate - h.rate[2]
+    if innovation * innovation > _SAME_TURN_RATE * total:
+        return
+    row = np.empty(7)
+    for j in range(7):
+        row[j] = h.cov[5, j]
+    for j in range(7):
+        for k in range(7):
+            if j < 6 or k < 6:  # the offset is a consider state here, too
+                h.cov[j, k] -= row[j] / total * row[k]
+    _symmetrise(h.cov)
+    gain = innovation / total
+    h.ego_x += gain * row[0]
+    h.ego_y += gain * row[1]
+    h.yaw = wrap(h.yaw + gain * row[2])
+    for j in range(3):
+        h.rate[j] += gain * row[3 + j]
 
 
 @kernel(error_model="numpy")
@@ -190,6 +231,7 @@ def _correct(h, star, correlation) -> None:
             for k in range(7):
                 if i == 3 or j < 6 or k < 6:
                     cov[j, k] -= row[j] / total * row[k]
+    _symmetrise(cov)
     h.ego_x += change[0]
     h.ego_y += change[1]
     h.yaw = wrap(h.yaw + change[2])
@@ -298,8 +340,58 @@ def _landing_std(h, other) -> float:
 
 
 @kernel(error_model="numpy")
+def _claimed_at(claim, other_x, other_y):
+    """A claim pose and its variances at a pivot: ego x, y [m], variance of each [m^2], yaw variance [rad^2]."""
+    cos, sin = math.cos(claim[0, 2]), math.sin(claim[0, 2])
+    rx, ry = cos * other_x - sin * other_y, sin * other_x + cos * other_y
+    variance = claim[1, 0] + claim[2, 1] + 2.0 * (rx * claim[2, 2] - ry * claim[1, 2])
+    variance += (rx * rx + ry * ry) * claim[3, 2]
+    return claim[0, 0] + rx, claim[0, 1] + ry, 0.5 * variance, claim[3, 2]
+
+
+@kernel(error_model="numpy")
+def _claim_evidence(h, claim) -> float:
+    """Evidence of a claim pose for a hypothesis [nats]: it may be false, so it never decides."""
+    x, y, variance, yaw_variance = _claimed_at(claim, h.other_x, h.other_y)
+    surprise = ((x - h.ego_x) ** 2 + (y - h.ego_y) ** 2) / (variance + 0.5 * (h.cov[0, 0] + h.cov[1, 1]))
+    surprise += wrap(claim[0, 2] - h.yaw) ** 2 / (yaw_variance + h.cov[2, 2])
+    return _CLAIM_EVIDENCE * math.exp(-0.5 * surprise)
+
+
+@kernel(error_model="numpy")
+def _try_claim(ego, other, sizes, star, pairs, claim, stamps, motion, noise, rounds) -> None:
+    """The star that starts from a claim pose."""
+    x = y = 0.0
+    for n in range(len(other)):
+        x += other[n, X] / len(other)
+        y += other[n, Y] / len(other)
+    star.other_x, star.other_y, star.yaw = x, y, claim[0, 2]
+    star.ego_x, star.ego_y, star.position_variance, star.yaw_variance = _claimed_at(claim, x, y)
+    star.offset = star.prior_offset = stamps
+    star.offset_variance = star.prior_offset_variance = motion.offset_std**2
+    star.other_vx = star.other_vy = 0.0
+    refine(ego, other, sizes, star, pairs, noise, rounds)
+
+
+@kernel(error_model="numpy")
 def advance(
-    old, ego, other, ego_ids, other_ids, last_differ, dt, stamps, stamps_before, seen, noise, motion, tries, rounds
+    old,
+    ego,
+    other,
+    ego_ids,
+    other_ids,
+    last_differ,
+    dt,
+    turn_rate,
+    turn_rate_variance,
+    stamps,
+    stamps_before,
+    claim,
+    seen,
+    noise,
+    motion,
+    tries,
+    rounds,
 ):
     """One frame: predict, follow, search, link, update.
 
@@ -311,8 +403,11 @@ def advance(
         other_ids: (N,) likewise.
         last_differ: whether the last boxes of both are known to be different objects, the agents' own vehicles.
         dt: seconds since the last frame.
+        turn_rate: of other's frame against ego's, from the motions of both frames [rad/s].
+        turn_rate_variance: its variance, infinite if unknown.
         stamps: time stamp of other's list minus that of ego's, 0 if it has none: the prior of the offset [s].
         stamps_before: the same in the last frame [s].
+        claim: (4, 3) x, y, yaw of a claimed pose and its covariance; infinite without a claim.
         seen: frames seen before this one.
         noise: the noise model.
         motion: the motion model.
@@ -329,7 +424,7 @@ def advance(
     memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
     miss_memory = min(memory, motion.miss_memory**steps)
     before = len(old)
-    stars = np.zeros(tries + before + 1, STAR)
+    stars = np.zeros(tries + before + 2, STAR)
     rows = np.empty((len(stars), most_pairs(ego, other, noise), 2), np.int64)
     star, pairs = stars[len(stars) - 1], np.empty((rows.shape[1], 2), np.int64)
     owner = np.empty(len(stars), np.int64)
@@ -341,10 +436,16 @@ def advance(
     if last_differ:
         sizes[len(ego) - 1, len(other) - 1] = -_IMPOSSIBLE
     for i in range(before):
+        if turn_rate_variance < np.inf:
+            _correct_turn_rate(old[i], turn_rate, turn_rate_variance)
         _predict(old[i], dt, motion)
         old[i].offset += stamps - stamps_before
     if len(ego) > 0 and len(other) > 0:
         count = search(ego, other, sizes, noise, stamps, motion.offset_std**2, tries, rounds, stars, rows)
+        if claim[0, 0] < np.inf:
+            _try_claim(ego, other, sizes, star, pairs, claim, stamps, motion, noise, rounds)
+            if star.pairs > 0:
+                count = add_star(stars, rows, count, star, pairs)
         for i in range(before):
             _follow(old[i], ego, other, sizes, star, pairs, noise, rounds)
             if star.pairs > 0:
@@ -396,9 +497,11 @@ def advance(
             _correct(h, stars[s], motion.correlation)
         else:
             _start(h, stars[s], motion)
-        evidence = stars[s].evidence
+        evidence = stars[s].evidence - motion.absence * missing_counterparts(ego, other, stars[s], rows[s])
         if motion.offset_std > 0.0:
             evidence -= 0.5 * ((h.offset - stamps) / motion.offset_std) ** 2
+        if claim[0, 0] < np.inf:
+            evidence += _claim_evidence(h, claim)
         h.evidence = memory * h.evidence + (1.0 - memory) * evidence
         _remember(h, stars[s], rows[s], ego_ids, other_ids)
 

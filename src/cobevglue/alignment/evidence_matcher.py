@@ -1,0 +1,172 @@
+"""The robust variant: stars scored by likelihood ratios, hypotheses carried over time, a verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+
+from cobevglue.alignment.alignment import Alignment
+from cobevglue.alignment.box_rows import box_rows, track_ids
+from cobevglue.alignment.config import BEVGlueConfig
+from cobevglue.alignment.frame_motion import FrameMotion
+from cobevglue.alignment.verdict import explain_refusal, pose_risk
+from cobevglue.boxes import Boxes
+from cobevglue.se2 import SE2
+from cobevglue.typing import FloatArray
+
+__all__ = ["EvidenceMatcher", "ListTimes"]
+
+
+@dataclass(frozen=True, slots=True)
+class ListTimes:
+    """Times of one pair of lists [s].
+
+    Attributes:
+        ego_step: since the ego's last list.
+        other_step: since the other's last list.
+        stamp_difference: the other's time stamp minus the ego's, where both have one on one clock; otherwise 0.
+    """
+
+    ego_step: float
+    other_step: float
+    stamp_difference: float = 0.0
+
+
+class EvidenceMatcher:
+    """Follows the hypotheses of one pair of agents from frame to frame."""
+
+    def __init__(self, config: BEVGlueConfig) -> None:
+        self._config = config
+        self._kernels = _load_kernels()
+        self._noise = self._kernels.NoiseModel(
+            config.position_std,
+            config.heading_std,
+            config.length_std,
+            config.width_std,
+            config.size_gain,
+            config.density,
+            config.flip_probability,
+            config.sizes,
+            config.heading_flips,
+            config.range_tolerance,
+            config.one_to_one,
+        )
+        self._motion = self._kernels.Motion(
+            config.acceleration,
+            config.yaw_acceleration,
+            config.speed_std,
+            config.yaw_rate_std,
+            config.correlation,
+            config.memory,
+            config.miss_memory,
+            config.link_distance,
+            config.link_angle,
+            config.tracks,
+            config.offset_std if config.time_offset else 0.0,
+            config.offset_drift if config.time_offset else 0.0,
+            config.absence,
+        )
+        self._rounds = config.rounds if config.refit else 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
+        self._seen = 0
+        self._stamp_difference = 0.0
+        self._ego_motion, self._other_motion = FrameMotion(), FrameMotion()
+
+    def align(
+        self,
+        ego: Boxes,
+        other: Boxes,
+        times: ListTimes,
+        ego_body: bool = False,
+        other_body: bool = False,
+        prior: tuple[SE2, FloatArray] | None = None,
+    ) -> Alignment:
+        """The pose of this pair of frames.
+
+        Args:
+            ego: in the ego frame.
+            other: in the other agent's frame.
+            times: of the lists.
+            ego_body: whether the last box of `ego` is its own vehicle.
+            other_body: likewise of `other`.
+            prior: a claimed ego_SE2_other and its (3, 3) covariance.
+        """
+        config = self._config
+        if not config.temporal:
+            self.reset()
+        ego_rows, other_rows = box_rows(ego), box_rows(other)
+        ego_count, other_count = len(ego) - ego_body, len(other) - other_body
+        self._ego_motion.velocities(ego_rows[:ego_count], track_ids(ego)[:ego_count], times.ego_step)
+        velocity = self._other_motion.velocities(
+            other_rows[:other_count], track_ids(other)[:other_count], times.other_step
+        )
+        if config.time_offset:
+            other_rows[:other_count, 5:] = velocity  # the own vehicle does not move in its own frame
+        stamp_difference = times.stamp_difference if config.time_offset else 0.0
+        claim = np.full((4, 3), np.inf)
+        if prior is not None:
+            claim[0], claim[1:] = (prior[0].x, prior[0].y, prior[0].yaw), prior[1]
+        self._hypotheses, margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
+            self._hypotheses,
+            ego_rows,
+            other_rows,
+            track_ids(ego),
+            track_ids(other),
+            ego_body and other_body,
+            times.ego_step,
+            self._ego_motion.twist[2] - self._other_motion.twist[2],
+            self._ego_motion.turn_rate_variance + self._other_motion.turn_rate_variance,
+            stamp_difference,
+            self._stamp_difference,
+            claim,
+            self._seen,
+            self._noise,
+            self._motion,
+            config.tries,
+            self._rounds,
+        )
+        self._seen += 1
+        self._stamp_difference = stamp_difference
+        if not len(self._hypotheses):
+            return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0, risk=1.0)
+        evidence = float(self._hypotheses[0]["evidence"])
+        risk = pose_risk(evidence, margin, landing_std, config) if len(pairs) else 1.0
+        reason = explain_refusal(evidence, margin, landing_std, len(pairs), config) if config.verdict else ""
+        if reason:
+            return Alignment.refused(reason, evidence, margin, risk)
+        pose = SE2(x, y, yaw)
+        if not config.time_offset:
+            return Alignment(pose, pairs, covariance[:3, :3], "", evidence, margin, risk)
+        return Alignment(
+            pose,
+            pairs,
+            covariance[:3, :3],
+            "",
+            evidence,
+            margin,
+            risk,
+            time_offset=offset,
+            time_offset_std=math.sqrt(max(covariance[3, 3], 0.0)),
+            ego_SE2_list=pose @ self._other_motion.before(-offset),
+            other_velocity=velocity,
+        )
+
+
+def _nothing_in_common(ego: Boxes, other: Boxes) -> str:
+    if len(ego) == 0 or len(other) == 0:
+        return f"{'ego' if len(ego) == 0 else 'other'} sees no object"
+    return "no two boxes are similar enough to be one object"
+
+
+def _load_kernels() -> ModuleType:
+    """Import the numba kernels: only here, because numba takes longer to import than everything else together."""
+    from cobevglue.alignment import pose_filter
+
+    return pose_filter
