@@ -14,7 +14,7 @@ from cobevglue.tracking import SortConfig
 @pytest.mark.parametrize(
     ("settings", "wrong", "meant"),
     [
-        (BEVGlueConfig, "min_margn", "min_margin"),
+        (BEVGlueConfig, "tolernce", "tolerance"),
         (DetectionErrors, "yaw_sd", "yaw_std"),
         (JunctionSettings, "agent", "agents"),
         (SortConfig, "max_ages", "max_age"),

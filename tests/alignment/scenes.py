@@ -119,18 +119,23 @@ def junction(seed: int) -> tuple[ObjectListFrame, ...]:
 def drive(
     common: int,
     seed: int,
-    only_each: int = 8,
+    only_each: int = 4,
     frames: int = 30,
     missed: float = 0.1,
     first_id: int | None = None,
 ) -> list[Pair]:
     """Two agents drive past standing objects at 10 Hz, each in its own bend; some are common, some seen by one only.
 
+    What one agent alone sees lies 60 m to one side, out of the other's view.
+
     With `first_id` the boxes have track ids from there on, and those of the two agents have nothing to do with each
     other.
     """
     rng = np.random.default_rng([seed, 1, 0])
     world = random_boxes(common + 2 * only_each, rng)
+    center = world.center.copy()
+    center[common:, 1] += np.where(np.arange(2 * only_each) < only_each, 60.0, -60.0)
+    world = world.replace(center=center)
     starts = [random_pose(rng, 40.0) for _ in range(2)]
     ego_sees = np.arange(common + only_each)
     other_sees = np.r_[0:common, common + only_each : len(world)]

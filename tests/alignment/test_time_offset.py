@@ -56,7 +56,7 @@ def last_alignment(age: float, config: BEVGlueConfig, stamped: float | None = No
 
 @pytest.mark.parametrize("age", [0.0, 0.1, 0.2, 0.3])
 def test_offset_and_pose_at_ego_instant_are_estimated(age: float) -> None:
-    alignment, _ = last_alignment(age, BEVGlueConfig(time_offset=True))
+    alignment, _ = last_alignment(age, BEVGlueConfig())
     assert alignment.time_offset == pytest.approx(-age, abs=0.03)
     assert alignment.time_offset_std < 0.05
     assert alignment.ego_SE2_other is not None
@@ -71,7 +71,7 @@ def test_offset_and_pose_at_ego_instant_are_estimated(age: float) -> None:
 
 def test_boxes_are_brought_to_ego_instant() -> None:
     """Those of a list 0.3 s old lie up to 4 m off as they are."""
-    alignment, other = last_alignment(0.3, BEVGlueConfig(time_offset=True))
+    alignment, other = last_alignment(0.3, BEVGlueConfig())
     truth = vehicles(1.0 + 0.1 * (FRAMES - 1)).transform(WORLD_SE2_EGO.inverse())
     gap = np.linalg.norm(alignment.boxes_at_ego_instant(other).center - truth.center, axis=1)
     assert gap.max() < 1.2
@@ -82,14 +82,14 @@ def test_boxes_are_brought_to_ego_instant() -> None:
 
 def test_time_stamp_of_other_is_the_prior() -> None:
     """On one clock the stamps tell the offset; clocks that differ by more than a second are two."""
-    one_clock, _ = last_alignment(0.3, BEVGlueConfig(time_offset=True, offset_std=0.01), stamped=-0.3)
+    one_clock, _ = last_alignment(0.3, BEVGlueConfig(stamped_offset_std=0.01), stamped=-0.3)
     assert one_clock.time_offset == pytest.approx(-0.3, abs=0.01)
-    two_clocks, _ = last_alignment(0.1, BEVGlueConfig(time_offset=True), stamped=1000.0)
+    two_clocks, _ = last_alignment(0.1, BEVGlueConfig(), stamped=1000.0)
     assert two_clocks.time_offset == pytest.approx(-0.1, abs=0.03)
 
 
 def test_offset_keeps_its_prior_where_nothing_moves() -> None:
-    glue = BEVGlue(BEVGlueConfig(time_offset=True))
+    glue = BEVGlue(BEVGlueConfig())
     parked = vehicles(0.0)[SPEEDS == 0.0]
     for _ in range(20):
         alignment = glue.align(parked, parked.transform(SE2(5.0, 1.0, 0.3)))
@@ -97,8 +97,8 @@ def test_offset_keeps_its_prior_where_nothing_moves() -> None:
     assert alignment.time_offset_std > 0.14
 
 
-def test_offset_is_not_estimated_by_default() -> None:
-    alignment, other = last_alignment(0.0, BEVGlueConfig())
+def test_offset_is_zero_where_it_is_not_estimated() -> None:
+    alignment, other = last_alignment(0.0, BEVGlueConfig(time_offset=False))
     assert alignment.time_offset == 0.0
     assert math.isnan(alignment.time_offset_std)
     assert alignment.ego_SE2_other is not None

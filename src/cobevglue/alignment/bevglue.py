@@ -118,7 +118,7 @@ class BEVGlue:
         return ListTimes(
             step,
             step if before is None else max(other_time - before, 0.0),
-            stamp_difference if abs(stamp_difference) <= _SAME_CLOCK else 0.0,
+            stamp_difference if abs(stamp_difference) <= _SAME_CLOCK else None,
         )
 
 

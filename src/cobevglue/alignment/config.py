@@ -74,7 +74,8 @@ class BEVGlueConfig(Settings):
         yaw_acceleration: process noise of the relative yaw rate [rad/s^2 per sqrt(Hz)].
         speed_std: prior of the relative velocity [m/s].
         yaw_rate_std: prior of the relative yaw rate [rad/s].
-        offset_std: prior of the time offset, beyond the difference of the two time stamps where both are given [s].
+        offset_std: prior of the time offset where the lists have no stamps of one clock [s].
+        stamped_offset_std: prior of the time offset beyond the difference of the stamps, where they have [s].
         offset_drift: process noise of the time offset [s per sqrt(s)].
         absence: evidence against a pose for each box that lies in the view of the other agent and has no counterpart
             [nats].
@@ -84,6 +85,8 @@ class BEVGlueConfig(Settings):
         link_distance: a star this near to a predicted pose (at its pivot) continues the hypothesis [m].
         link_angle: and this near in yaw [rad].
         chance_evidence: that the best pose of two agents with nothing in common reaches [nats].
+        self_similarity: share of the evidence of the best different pose by which the best one has to exceed it before
+            it counts as better, so that a long row of equal gaps stays ambiguous.
         tolerance: a pose is wrong if it lands boxes farther off than this [m].
         risk: accept only if the estimated probability of a wrong pose is below this.
         tries: seeds that are refined in each frame.
@@ -119,8 +122,9 @@ class BEVGlueConfig(Settings):
     speed_std: _Positive = 15.0
     yaw_rate_std: _Positive = 0.3
     offset_std: _Positive = 0.15
+    stamped_offset_std: _Positive = 0.05
     offset_drift: _NotNegative = 0.02
-    absence: _NotNegative = 1.0
+    absence: _NotNegative = 0.7
     correlation: _Positive = 3.0
     memory: _Share = 0.92
     miss_memory: _Share = 0.6
@@ -128,6 +132,7 @@ class BEVGlueConfig(Settings):
     link_angle: _Positive = 0.15
 
     chance_evidence: _NotNegative = 6.0
+    self_similarity: _NotNegative = 0.33
     tolerance: _Positive = 3.0
     risk: _Share = 0.05
 

@@ -12,7 +12,7 @@ from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.box_rows import box_rows, track_ids
 from cobevglue.alignment.config import BEVGlueConfig
 from cobevglue.alignment.frame_motion import FrameMotion
-from cobevglue.alignment.verdict import explain_refusal, pose_risk
+from cobevglue.alignment.verdict import judge
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray
@@ -27,12 +27,12 @@ class ListTimes:
     Attributes:
         ego_step: since the ego's last list.
         other_step: since the other's last list.
-        stamp_difference: the other's time stamp minus the ego's, where both have one on one clock; otherwise 0.
+        stamp_difference: the other's time stamp minus the ego's, if both are of one clock; otherwise None.
     """
 
     ego_step: float
     other_step: float
-    stamp_difference: float = 0.0
+    stamp_difference: float | None = None
 
 
 class EvidenceMatcher:
@@ -65,7 +65,6 @@ class EvidenceMatcher:
             config.link_distance,
             config.link_angle,
             config.tracks,
-            config.offset_std if config.time_offset else 0.0,
             config.offset_drift if config.time_offset else 0.0,
             config.absence,
         )
@@ -76,7 +75,7 @@ class EvidenceMatcher:
         """Forget all frames."""
         self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
         self._seen = 0
-        self._stamp_difference = 0.0
+        self._expected_offset = 0.0
         self._ego_motion, self._other_motion = FrameMotion(), FrameMotion()
 
     def align(
@@ -109,7 +108,11 @@ class EvidenceMatcher:
         )
         if config.time_offset:
             other_rows[:other_count, 5:] = velocity  # the own vehicle does not move in its own frame
-        stamp_difference = times.stamp_difference if config.time_offset else 0.0
+        expected_offset, offset_std = 0.0, 0.0
+        if config.time_offset:
+            stamped = times.stamp_difference is not None
+            expected_offset = times.stamp_difference or 0.0
+            offset_std = config.stamped_offset_std if stamped else config.offset_std
         claim = np.full((4, 3), np.inf)
         if prior is not None:
             claim[0], claim[1:] = (prior[0].x, prior[0].y, prior[0].yaw), prior[1]
@@ -123,8 +126,9 @@ class EvidenceMatcher:
             times.ego_step,
             self._ego_motion.twist[2] - self._other_motion.twist[2],
             self._ego_motion.turn_rate_variance + self._other_motion.turn_rate_variance,
-            stamp_difference,
-            self._stamp_difference,
+            expected_offset,
+            expected_offset - self._expected_offset,
+            offset_std,
             claim,
             self._seen,
             self._noise,
@@ -133,17 +137,16 @@ class EvidenceMatcher:
             self._rounds,
         )
         self._seen += 1
-        self._stamp_difference = stamp_difference
+        self._expected_offset = expected_offset
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0, risk=1.0)
         evidence = float(self._hypotheses[0]["evidence"])
-        risk = pose_risk(evidence, margin, landing_std, config) if len(pairs) else 1.0
-        reason = explain_refusal(evidence, margin, landing_std, len(pairs), config) if config.verdict else ""
-        if reason:
-            return Alignment.refused(reason, evidence, margin, risk)
+        verdict = judge(evidence, margin, landing_std, len(pairs), self._seen, config)
+        if verdict.reason and config.verdict:
+            return Alignment.refused(verdict.reason, evidence, margin, verdict.risk)
         pose = SE2(x, y, yaw)
         if not config.time_offset:
-            return Alignment(pose, pairs, covariance[:3, :3], "", evidence, margin, risk)
+            return Alignment(pose, pairs, covariance[:3, :3], "", evidence, margin, verdict.risk)
         return Alignment(
             pose,
             pairs,
@@ -151,7 +154,7 @@ class EvidenceMatcher:
             "",
             evidence,
             margin,
-            risk,
+            verdict.risk,
             time_offset=offset,
             time_offset_std=math.sqrt(max(covariance[3, 3], 0.0)),
             ego_SE2_list=pose @ self._other_motion.before(-offset),

@@ -88,7 +88,6 @@ class Motion(NamedTuple):
     link_distance: float
     link_angle: float
     use_tracks: bool
-    offset_std: float
     offset_drift: float
     absence: float
 
@@ -359,7 +358,7 @@ def _claim_evidence(h, claim) -> float:
 
 
 @kernel(error_model="numpy")
-def _try_claim(ego, other, sizes, star, pairs, claim, stamps, motion, noise, rounds) -> None:
+def _try_claim(ego, other, sizes, star, pairs, claim, expected_offset, offset_std, noise, rounds) -> None:
     """The star that starts from a claim pose."""
     x = y = 0.0
     for n in range(len(other)):
@@ -367,8 +366,8 @@ def _try_claim(ego, other, sizes, star, pairs, claim, stamps, motion, noise, rou
         y += other[n, Y] / len(other)
     star.other_x, star.other_y, star.yaw = x, y, claim[0, 2]
     star.ego_x, star.ego_y, star.position_variance, star.yaw_variance = _claimed_at(claim, x, y)
-    star.offset = star.prior_offset = stamps
-    star.offset_variance = star.prior_offset_variance = motion.offset_std**2
+    star.offset = star.prior_offset = expected_offset
+    star.offset_variance = star.prior_offset_variance = offset_std**2
     star.other_vx = star.other_vy = 0.0
     refine(ego, other, sizes, star, pairs, noise, rounds)
 
@@ -384,8 +383,9 @@ def advance(
     dt,
     turn_rate,
     turn_rate_variance,
-    stamps,
-    stamps_before,
+    expected_offset,
+    offset_step,
+    offset_std,
     claim,
     seen,
     noise,
@@ -405,8 +405,9 @@ def advance(
         dt: seconds since the last frame.
         turn_rate: of other's frame against ego's, from the motions of both frames [rad/s].
         turn_rate_variance: its variance, infinite if unknown.
-        stamps: time stamp of other's list minus that of ego's, 0 if it has none: the prior of the offset [s].
-        stamps_before: the same in the last frame [s].
+        expected_offset: prior of the time offset, from the time expected_offset if there are any [s].
+        offset_step: how much the expected offset changed since the last frame [s].
+        offset_std: standard deviation of the prior; 0 for a known offset [s].
         claim: (4, 3) x, y, yaw of a claimed pose and its covariance; infinite without a claim.
         seen: frames seen before this one.
         noise: the noise model.
@@ -439,11 +440,11 @@ def advance(
         if turn_rate_variance < np.inf:
             _correct_turn_rate(old[i], turn_rate, turn_rate_variance)
         _predict(old[i], dt, motion)
-        old[i].offset += stamps - stamps_before
+        old[i].offset += offset_step
     if len(ego) > 0 and len(other) > 0:
-        count = search(ego, other, sizes, noise, stamps, motion.offset_std**2, tries, rounds, stars, rows)
+        count = search(ego, other, sizes, noise, expected_offset, offset_std**2, tries, rounds, stars, rows)
         if claim[0, 0] < np.inf:
-            _try_claim(ego, other, sizes, star, pairs, claim, stamps, motion, noise, rounds)
+            _try_claim(ego, other, sizes, star, pairs, claim, expected_offset, offset_std, noise, rounds)
             if star.pairs > 0:
                 count = add_star(stars, rows, count, star, pairs)
         for i in range(before):
@@ -498,8 +499,8 @@ def advance(
         else:
             _start(h, stars[s], motion)
         evidence = stars[s].evidence - motion.absence * missing_counterparts(ego, other, stars[s], rows[s])
-        if motion.offset_std > 0.0:
-            evidence -= 0.5 * ((h.offset - stamps) / motion.offset_std) ** 2
+        if offset_std > 0.0:
+            evidence -= 0.5 * ((h.offset - expected_offset) / offset_std) ** 2
         if claim[0, 0] < np.inf:
             evidence += _claim_evidence(h, claim)
         h.evidence = memory * h.evidence + (1.0 - memory) * evidence

@@ -272,17 +272,33 @@ def copy_pairs(target, source, count) -> None:
 
 
 @kernel(error_model="numpy")
+def _same_star(a, a_pairs, b, b_pairs) -> bool:
+    """Whether two stars have one pose, or the same pairs, at different time offsets for example."""
+    if same_pose(a, b, SAME_DISTANCE, SAME_ANGLE):
+        return True
+    if a.pairs != b.pairs or a.pairs < 2:
+        return False
+    for i in range(a.pairs):
+        found = False
+        for k in range(b.pairs):
+            found = found or (a_pairs[i, 0] == b_pairs[k, 0] and a_pairs[i, 1] == b_pairs[k, 1])
+        if not found:
+            return False
+    return True
+
+
+@kernel(error_model="numpy")
 def add_star(stars, rows, count, star, pairs) -> int:
     """Add a star to the first `count` of `stars` and return their new number.
 
-    Of stars with one pose the best stays. The last record of `stars` is scratch and never filled.
+    Of stars with one pose or the same pairs the best stays. The last record of `stars` is scratch and never filled.
     """
     for i in range(count):
-        if stars[i].evidence >= star.evidence and same_pose(stars[i], star, SAME_DISTANCE, SAME_ANGLE):
+        if stars[i].evidence >= star.evidence and _same_star(stars[i], rows[i], star, pairs):
             return count
     kept = 0
     for i in range(count):
-        if not same_pose(stars[i], star, SAME_DISTANCE, SAME_ANGLE):
+        if not _same_star(stars[i], rows[i], star, pairs):
             if kept < i:
                 stars[kept] = stars[i]
                 copy_pairs(rows[kept], rows[i], stars[i].pairs)

@@ -8,60 +8,72 @@ farther off than the tolerance is added.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from cobevglue.alignment.config import BEVGlueConfig
 
-__all__ = ["explain_refusal", "landing_risk", "pose_risk"]
+__all__ = ["Verdict", "judge", "landing_risk"]
 
 _UNMODELLED = 0.001
 """Least risk: what no model here knows of, such as objects with false positions in both lists."""
+_LARGEST_EXPONENT = 500.0
 
 
-def pose_risk(evidence: float, margin: float, landing_std: float, config: BEVGlueConfig) -> float:
-    """Estimated probability that a pose lands the other agent's boxes farther off than the tolerance.
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The risk of a pose, and why it is refused.
+
+    Attributes:
+        risk: estimated probability that the pose lands the other agent's boxes farther off than the tolerance.
+        reason: why it is refused; "" if the risk is low enough.
+    """
+
+    risk: float
+    reason: str
+
+
+def judge(
+    evidence: float, margin: float, landing_std: float, pairs: int, frames: int, config: BEVGlueConfig
+) -> Verdict:
+    """The verdict on the best hypothesis.
 
     Args:
-        evidence: of the best hypothesis [nats].
+        evidence: of the hypothesis [nats].
         margin: by how much that exceeds the evidence of the best different one [nats].
         landing_std: standard deviation of where the other's boxes land in the ego frame [m].
-        config: gives the evidence of chance and the tolerance.
-    """
-    chance, second = _odds_against(evidence, margin, config)
-    right = (1.0 - landing_risk(landing_std, config.tolerance)) / (1.0 + chance + second)
-    return _UNMODELLED + (1.0 - _UNMODELLED) * (1.0 - right)
-
-
-def landing_risk(landing_std: float, tolerance: float) -> float:
-    """Probability that boxes land farther off than `tolerance` [m], of the right hypothesis (Rayleigh distribution)."""
-    return math.exp(-0.5 * (tolerance / max(landing_std, 1e-3)) ** 2)
-
-
-def explain_refusal(evidence: float, margin: float, landing_std: float, pairs: int, config: BEVGlueConfig) -> str:
-    """Why a pose is refused, or an empty string if its risk is low enough.
-
-    Args:
-        evidence: see `pose_risk`.
-        margin: likewise.
-        landing_std: likewise.
-        pairs: matched pairs in this frame.
-        config: gives the accepted risk.
+        pairs: that it matches in this frame.
+        frames: that were seen so far, this one included.
+        config: gives the accepted risk and the parameters of the posterior.
     """
     if pairs == 0:
-        return "no object in this frame supports the pose followed so far"
-    risk = pose_risk(evidence, margin, landing_std, config)
-    if risk < config.risk:
-        return ""
-    chance, second = _odds_against(evidence, margin, config)
+        return Verdict(1.0, "no object in this frame supports the pose followed so far")
+    chance = _likelihood(config.chance_evidence - evidence)
+    # Where a different pose has much evidence, too, the pattern is regular, and the agents may see different parts of
+    # what looks alike: then the margin only tells which parts. One frame cannot know; frames in which things move can.
+    alike = config.self_similarity * (1.0 + 1.0 / frames) * max(evidence - margin, 0.0)
+    second = _likelihood(alike - margin)
     imprecise = landing_risk(landing_std, config.tolerance)
+    risk = _UNMODELLED + (1.0 - _UNMODELLED) * (1.0 - (1.0 - imprecise) / (1.0 + chance + second))
+    if risk < config.risk:
+        return Verdict(risk, "")
     if imprecise >= max(chance, second):
         cause = f"too uncertain: boxes would land within {landing_std:.1f} m"
     elif chance >= second:
         cause = f"too few common objects: evidence {evidence:.1f} nats"
     else:
         cause = f"ambiguous: a different pose is only {margin:.1f} nats behind"
-    return f"{cause}; risk {risk:.2g}, {config.risk:.2g} allowed"
+    return Verdict(risk, f"{cause}; risk {risk:.2g}, {config.risk:.2g} allowed")
 
 
-def _odds_against(evidence: float, margin: float, config: BEVGlueConfig) -> tuple[float, float]:
-    """Likelihoods of "nothing in common" and of the best different pose, relative to the best pose's."""
-    return math.exp(min(config.chance_evidence - evidence, 500.0)), math.exp(-max(margin, -500.0))
+def landing_risk(landing_std: float, tolerance: float) -> float:
+    """Probability that boxes land farther off than `tolerance` [m] under the right hypothesis.
+
+    Normal in one direction, since one dominates as a rule: along the motion if the time offset is uncertain, across
+    the line of sight if the yaw is.
+    """
+    return math.erfc(tolerance / (math.sqrt(2.0) * max(landing_std, 1e-3)))
+
+
+def _likelihood(log_ratio: float) -> float:
+    """Of an alternative, relative to the best hypothesis'."""
+    return math.exp(min(log_ratio, _LARGEST_EXPONENT))
