@@ -1,4 +1,4 @@
-"""A junction as object lists that several agents detect, with the ground truth; deterministic for a seed.
+"""Object lists that several agents detect in a scene, with the ground truth; deterministic for a seed.
 
     for frame in Junction(seed=1):
         ego, other = frame.agents["car1"], frame.agents["car2"]
@@ -6,7 +6,8 @@
         frame.ego_SE2_other("car1", "car2")     # the true relative pose
         frame.matches("car1", "car2")           # pairs of rows of the same vehicle
 
-Without LiDAR simulation: detections are the visible true boxes with the errors of `DetectionErrors`.
+Without LiDAR simulation: detections are the visible true boxes with the errors of `DetectionErrors`. `Junction` is a
+sequence of frames; `observe` is the view of one agent of any scene of `object_scenes` at any time.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from cobevglue.boxes import Boxes
 from cobevglue.disturbance.detection_errors import DetectionErrors, add_detection_errors
 from cobevglue.se2 import SE2
 from cobevglue.settings import Settings
-from cobevglue.simulation.scripted_traffic import place_traffic
+from cobevglue.simulation.object_scenes import Mast
+from cobevglue.simulation.object_scenes.junction import place_traffic
+from cobevglue.simulation.scripted_traffic import LIDAR_HEIGHT
 from cobevglue.simulation.visibility import is_visible
 from cobevglue.typing import IntArray
 
-__all__ = ["AgentView", "Junction", "JunctionSettings", "ObjectListFrame"]
+__all__ = ["AgentView", "Junction", "JunctionSettings", "ObjectListFrame", "SensorSettings", "observe"]
 
 _TRAFFIC_STREAM = 0
 _FIRST_DETECTION_STREAM = 1  # and one stream more for each agent after the first
@@ -34,7 +37,21 @@ _FIRST_DETECTION_STREAM = 1  # and one stream more for each agent after the firs
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class JunctionSettings(Settings):
+class SensorSettings(Settings):
+    """What an agent detects.
+
+    Attributes:
+        sensor_range: maximum distance of visible objects' centres [m].
+        min_visible: minimum unoccluded share of a visible object's angular width.
+        errors: detection errors; `DetectionErrors.none()` for perfect detectors.
+    """
+
+    sensor_range: _Positive = 70.0
+    min_visible: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    errors: DetectionErrors = DetectionErrors()
+
+
+class JunctionSettings(SensorSettings):
     """Settings of the junction.
 
     Attributes:
@@ -54,9 +71,6 @@ class JunctionSettings(Settings):
     vehicles: Annotated[int, Field(ge=1, le=100)] = 32
     duration: _Positive = 8.0
     rate: _Positive = 10.0
-    sensor_range: _Positive = 70.0
-    min_visible: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
-    errors: DetectionErrors = DetectionErrors()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,7 +82,8 @@ class AgentView:
         object_id: (M,) object id of each detection, -1 for a false positive.
         visible: true boxes of all visible objects in the agent's LiDAR frame; track_id is the object id.
         world_SE2_agent: pose of the agent.
-        own_id: object id of the agent itself, which only other agents detect.
+        own_id: object id of the agent itself, which only other agents detect; -1 for a mast.
+        body: one-row true box of the agent's own vehicle in its LiDAR frame; None for a mast.
     """
 
     boxes: Boxes
@@ -76,6 +91,7 @@ class AgentView:
     visible: Boxes
     world_SE2_agent: SE2
     own_id: int
+    body: Boxes | None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,16 +162,35 @@ class Junction:
         index %= len(self)
         time = index / self.settings.rate
         objects = self.traffic.at(time)
-        agents = {f"car{i + 1}": self._view(objects, i, index) for i in range(self.settings.agents)}
+        agents = {}
+        for i in range(self.settings.agents):
+            rng = np.random.default_rng([self.seed, _FIRST_DETECTION_STREAM + i, index])
+            agents[f"car{i + 1}"] = observe(objects, i, self.settings, rng)
         return ObjectListFrame(index=index, time=time, agents=agents, objects=objects)
 
-    def _view(self, objects: Boxes, agent: int, index: int) -> AgentView:
-        """View of the agent with this object id; `objects` are in the world frame."""
-        world_SE2_agent = SE2(objects.center[agent, 0], objects.center[agent, 1], objects.yaw[agent])
-        others = objects[np.arange(len(objects)) != agent].transform(world_SE2_agent.inverse())
-        visible = others[is_visible(others, self.settings.sensor_range, self.settings.min_visible)]
-        rng = np.random.default_rng([self.seed, _FIRST_DETECTION_STREAM + agent, index])
-        boxes, rows = add_detection_errors(visible, self.settings.errors, rng)
-        assert visible.track_id is not None
-        object_id = np.append(visible.track_id, -1)  # row -1, a false positive, is object -1
-        return AgentView(boxes, object_id[rows], visible, world_SE2_agent, agent)
+
+def observe(objects: Boxes, agent: int | Mast, sensor: SensorSettings, rng: np.random.Generator) -> AgentView:
+    """What an agent detects.
+
+    Args:
+        objects: true boxes of all vehicles in the world frame at one instant; track_id is the object id, and the row.
+        agent: object id of the agent's own vehicle, or a mast, which looks over vehicles.
+        sensor: its settings.
+        rng: random generator of this agent and frame.
+    """
+    if isinstance(agent, Mast):
+        world_SE2_agent, own_id = agent.world_SE2_mast, -1
+        others, body = objects.transform(world_SE2_agent.inverse()), None
+        others = others.replace(center=others.center - [0.0, 0.0, agent.height - LIDAR_HEIGHT])
+    else:
+        world_SE2_agent, own_id = SE2(objects.center[agent, 0], objects.center[agent, 1], objects.yaw[agent]), agent
+        in_agent = objects.transform(world_SE2_agent.inverse())
+        others, body = in_agent[np.arange(len(objects)) != agent], in_agent[agent].replace(track_id=None)
+    # Only what is within range is seen and hides something.
+    distance = np.hypot(others.center[:, 0], others.center[:, 1])
+    others = others[distance <= sensor.sensor_range + others.size[:, 0]]
+    visible = others[is_visible(others, sensor.sensor_range, sensor.min_visible, over_tops=isinstance(agent, Mast))]
+    boxes, rows = add_detection_errors(visible, sensor.errors, rng)
+    assert visible.track_id is not None
+    object_id = np.append(visible.track_id, -1)  # row -1, a false positive, is object -1
+    return AgentView(boxes, object_id[rows], visible, world_SE2_agent, own_id, body)
