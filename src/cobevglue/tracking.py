@@ -48,6 +48,10 @@ _SAME_PLACE = 0.2
 """Predictions that move by less [m] when the frame's motion is corrected need no other association."""
 _ROUNDS = 4
 """Most rounds of associating and correcting the frame's motion in an update; one is the rule."""
+_NEW = 0.9
+"""Share of the velocity's prior above which nothing is known of it: the object was seen once."""
+_ASIDE, _SAME_ROAD, _SAME_LENGTH = 1.2, math.sin(math.radians(15.0)), 1.5
+"""How far beside its course [m], how much turned (sine) and how much longer [m] a fast new object is seen next."""
 _HEADING_GAIN, _SHAPE_GAIN, _FRONT_GAIN = 0.5, 0.3, 0.2
 """Shares of a new detection in a track's heading, its size and height, and the vote on which end is the front."""
 
@@ -69,6 +73,7 @@ class SortConfig(Settings):
         position_noise: standard deviation of a detected centre on each axis [m].
         acceleration_noise: standard deviation of an object's acceleration on each axis [m/s^2].
         velocity_prior: standard deviation of a new object's own velocity on each axis [m/s].
+        max_speed: the fastest objects relative to the frame [m/s].
         frame_motion: estimate the frame's own motion; switch it off where the frame is known to stand still.
         frame_speed_prior: standard deviation of the frame's velocity on each axis at the start [m/s].
         frame_turn_prior: standard deviation of the frame's turn rate at the start [rad/s].
@@ -87,6 +92,7 @@ class SortConfig(Settings):
     position_noise: float = Field(default=0.3, gt=0, allow_inf_nan=False)
     acceleration_noise: float = Field(default=4.0, gt=0, allow_inf_nan=False)
     velocity_prior: float = Field(default=10.0, gt=0, allow_inf_nan=False)
+    max_speed: float = Field(default=70.0, gt=0, allow_inf_nan=False)
     frame_motion: bool = True
     frame_speed_prior: float = Field(default=20.0, gt=0, allow_inf_nan=False)
     frame_turn_prior: float = Field(default=0.5, gt=0, allow_inf_nan=False)
@@ -243,7 +249,32 @@ class Sort:
             if np.abs(at - before).max() < _SAME_PLACE:
                 break
         s.position, s.velocity, s.yaw = at, frame.turn(s.velocity), s.yaw + frame.yaw
-        return rows, columns
+        fast_rows, fast_columns = self._assign_fast(rows, boxes, columns, dt)
+        return np.concatenate([rows, fast_rows]), np.concatenate([columns, fast_columns])
+
+    def _assign_fast(self, rows: IntArray, boxes: Boxes, columns: IntArray, dt: float) -> tuple[IntArray, IntArray]:
+        """Further rows of tracks and of boxes: new objects that went far along their heading since they were first seen.
+
+        The velocity of a new object is unknown, and oncoming traffic moves by more than `max_distance` between frames.
+        What else is left over is taken for it where it lies straight ahead or behind.
+        """
+        s = self._tracks
+        new = np.flatnonzero(s.variance[2] > (_NEW * self.config.velocity_prior) ** 2)
+        new = new[~np.isin(new, rows)]
+        left = np.flatnonzero(~np.isin(np.arange(len(boxes)), columns))
+        if not len(new) or not len(left):
+            return _NONE, _NONE
+        from scipy.optimize import linear_sum_assignment
+
+        offset = (_plane(boxes)[left][None, :] - s.position[new][:, None]) * np.exp(-1j * s.yaw[new])[:, None]
+        turn = np.abs(np.sin(boxes.yaw[left][None, :] - s.yaw[new][:, None]))
+        longer = np.abs(boxes.size[left, 0][None, :] - s.shape[new, 0][:, None])
+        same = (np.abs(offset.imag) < _ASIDE) & (turn < _SAME_ROAD) & (longer < _SAME_LENGTH)
+        gate = self.config.max_speed * dt
+        cost = np.where(same, np.abs(offset.real), np.inf)
+        found, taken = linear_sum_assignment(np.minimum(cost, gate))
+        inside = cost[found, taken] < gate
+        return new[found[inside]], left[taken[inside]]
 
     def _assign(self, at: _ComplexArray, boxes: Boxes) -> tuple[IntArray, IntArray]:
         """The cheapest one-to-one assignment of tracks, predicted `at` (N,), to boxes, within the gate.

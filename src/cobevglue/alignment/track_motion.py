@@ -55,7 +55,7 @@ class TrackNoise(NamedTuple):
 
     position: float = 0.3  # of a detected centre, each axis [m]
     acceleration: float = 3.0  # of an object [m/s^2]
-    speed: float = 10.0  # prior of an object [m/s]
+    speed: float = 25.0  # prior of an object [m/s]
     frame_speed: float = 20.0  # prior of the frame [m/s]
     frame_turn: float = 0.3  # prior of the frame [rad/s]
     frame_acceleration: float = 4.0  # [m/s^2]
