@@ -17,7 +17,7 @@ _SHRINKAGE = 9.0
 """A speed over ground below the root of this many variances counts as 0."""
 _TURN_RATE_STD = 0.015
 """Error of the turn rate beyond its variance [rad/s]."""
-_FEWEST_TRACKS = 3
+_FEWEST_TRACKS = 6
 """Tracks that it takes to measure the turn rate."""
 
 

@@ -48,6 +48,8 @@ _SAME_TURN_RATE = 9.0
 """Squared difference of two estimates of a turn rate, in variances, above which one of them is wrong."""
 _IMPOSSIBLE = 1e6
 """Evidence against a pair that cannot be one object [nats]."""
+_UNSEEN_ACCELERATION, _UNSEEN_TURN_ACCELERATION = 3.0, 0.7
+"""Of the other vehicle, between its list and ego's instant, beyond its motion at the list's [m/s^2, rad/s^2]."""
 _CLAIM_EVIDENCE = 2.0
 """Evidence of a claimed pose at most [nats]."""
 _STEP = 0.1
@@ -312,6 +314,13 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
 
 
 @kernel(error_model="numpy")
+def _unseen_motion(h):
+    """Variances of what other's vehicle did between its list and ego's instant and its tracks do not show [m^2, rad^2]."""
+    change = 0.25 * h.offset**4
+    return _UNSEEN_ACCELERATION**2 * change, _UNSEEN_TURN_ACCELERATION**2 * change
+
+
+@kernel(error_model="numpy")
 def _at_origin(h):
     """x, y, yaw and the (4, 4) covariance of them and the offset, at the origin of other's frame."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
@@ -325,6 +334,10 @@ def _at_origin(h):
             covariance[i, j] += factor * covariance[2, j]
         for j in range(4):
             covariance[j, i] += factor * covariance[j, 2]
+    shift, turn = _unseen_motion(h)
+    covariance[0, 0] += shift
+    covariance[1, 1] += shift
+    covariance[2, 2] += turn
     return h.ego_x - rx, h.ego_y - ry, h.yaw, covariance
 
 
@@ -332,9 +345,11 @@ def _at_origin(h):
 def _landing_std(h, other) -> float:
     """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
     total = 0.0
+    shift, turn = _unseen_motion(h)
     for n in range(len(other)):
         squared_arm = (other[n, X] - h.other_x) ** 2 + (other[n, Y] - h.other_y) ** 2
-        total += math.sqrt(h.cov[0, 0] + h.cov[1, 1] + h.cov[2, 2] * squared_arm)
+        unseen = 2.0 * shift + turn * (other[n, X] ** 2 + other[n, Y] ** 2)
+        total += math.sqrt(h.cov[0, 0] + h.cov[1, 1] + h.cov[2, 2] * squared_arm + unseen)
     return total / len(other) if len(other) else np.inf
 
 
