@@ -94,6 +94,7 @@ class CoBEVGlue:
         time: float | None = None,
         poses: Mapping[str, ArrayLike] | None = None,
         bodies: Mapping[str, Boxes] | None = None,
+        times: Mapping[str, float] | None = None,
     ) -> StepOutput:
         """The next frame.
 
@@ -105,6 +106,8 @@ class CoBEVGlue:
                 left out with fusion "none", which needs none: all others are then refused.
             bodies: one-row box of the own vehicle of each agent that knows it, in its LiDAR frame; transmitted with
                 the agent's boxes.
+            times: time stamp of each agent's cloud that has one of its own [s], on any clock; transmitted with its
+                boxes.
 
         Raises:
             ValueError: no such ego, a cloud or pose of a wrong shape, or `time` not later than the last; names the
@@ -113,9 +116,10 @@ class CoBEVGlue:
         if ego not in points:
             raise ValueError(f"ego: there is no agent {did_you_mean(ego, points)}")
         start = perf_counter()
-        seen = {agent: self.perceive(agent, cloud, time) for agent, cloud in points.items()}  # (1a)
+        stamps = times or {}
+        seen = {agent: self.perceive(agent, cloud, stamps.get(agent, time)) for agent, cloud in points.items()}  # (1a)
         seconds = {"perception": perf_counter() - start}
-        return self.collaborate(seen, ego, time, poses, seconds, bodies)
+        return self.collaborate(seen, ego, time, poses, seconds, bodies, times)
 
     def perceive(self, agent: str, points: ArrayLike, time: float | None = None) -> PerceptionOutput:
         """Equation (1a): the perception of one agent. See `step` for the arguments."""
@@ -133,6 +137,7 @@ class CoBEVGlue:
         poses: Mapping[str, ArrayLike] | None = None,
         seconds: Mapping[str, float] | None = None,
         bodies: Mapping[str, Boxes] | None = None,
+        times: Mapping[str, float] | None = None,
     ) -> StepOutput:
         """Equations (1b) to (1e): from the agents' observations to the ego's result. See `step` for the arguments."""
         if ego != self._ego:  # aligners filter the poses in the ego frame
@@ -147,7 +152,7 @@ class CoBEVGlue:
                 refused = Alignment.refused("no poses are given, and nothing is fused")
                 alignments = {agent: refused for agent in seen if agent != ego}
             else:
-                observations = self._observe(seen, ego, time, poses, bodies or {}, sent)
+                observations = self._observe(seen, ego, time, poses, bodies or {}, times or {}, sent)
                 alignments = self.aligner.align_group(ego, observations, time)  # (1b)
         alignment_bytes = {agent: sum(parts.values()) for agent, parts in sent.items()}
 
@@ -158,7 +163,8 @@ class CoBEVGlue:
                 data = encode_arrays(message) if message else b""
                 sent[agent][self.fusion.kind] = sent[agent].get(self.fusion.kind, 0) + len(data)
                 if alignment.ego_SE2_other is not None and message:
-                    received.append(Received(decode_arrays(data), alignment.ego_SE2_other))
+                    pose = alignment.ego_SE2_list or alignment.ego_SE2_other
+                    received.append(Received(decode_arrays(data), pose, alignment, observations[agent].boxes))
 
         with _timed("fusion", spent):
             boxes = self.fusion.fuse(seen[ego], received)  # (1c) to (1e)
@@ -175,19 +181,23 @@ class CoBEVGlue:
         time: float | None,
         poses: Mapping[str, ArrayLike] | None,
         bodies: Mapping[str, Boxes],
+        times: Mapping[str, float],
         sent: dict[str, dict[str, int]],
     ) -> dict[str, Observation]:
         """The aligner's inputs: for other agents, as decoded from messages, whose bytes are added to `sent`."""
         observations = {}
         for agent, view in seen.items():
             pose = _pose(agent, poses) if poses is not None and "pose" in self.aligner.needs else None
-            whole = Observation(view.boxes, bodies.get(agent), view.variance, view.points, view.features, pose)
+            whole = Observation(
+                view.boxes, bodies.get(agent), view.variance, view.points, view.features, pose, times.get(agent)
+            )
             try:
                 needed = self.aligner.select_inputs(whole)
             except ValueError as error:
                 raise ValueError(f"{agent}: {error}") from None
             if agent != ego:
-                parts = self.aligner.encode(agent, needed, 0.0 if time is None else time, self._frame)
+                stamp = times.get(agent, time)
+                parts = self.aligner.encode(agent, needed, 0.0 if stamp is None else stamp, self._frame)
                 needed = self.aligner.decode(parts, needed)
                 sent[agent].update({kind: len(data) for kind, data in parts.items()})
             observations[agent] = needed
@@ -202,7 +212,7 @@ def _transmitted(
     for agent, alignment in alignments.items():
         boxes = observations[agent].boxes
         if boxes is not None and alignment.ego_SE2_other is not None:
-            yield boxes.transform(alignment.ego_SE2_other)
+            yield alignment.boxes_at_ego_instant(boxes)
 
 
 def _pose(agent: str, poses: Mapping[str, ArrayLike]) -> FloatArray:

@@ -253,7 +253,7 @@ class Sort:
         return np.concatenate([rows, fast_rows]), np.concatenate([columns, fast_columns])
 
     def _assign_fast(self, rows: IntArray, boxes: Boxes, columns: IntArray, dt: float) -> tuple[IntArray, IntArray]:
-        """Further rows of tracks and of boxes: new objects that went far along their heading since they were first seen.
+        """Further rows of tracks and of boxes: new objects that went far along their heading since the first detection.
 
         The velocity of a new object is unknown, and oncoming traffic moves by more than `max_distance` between frames.
         What else is left over is taken for it where it lies straight ahead or behind.

@@ -85,7 +85,8 @@ class Aligner(Protocol):
     def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
         """The pose of `other` (its own frame) in `ego`'s frame; `time` [s] defaults to 0.1 s after the last call.
 
-        Where the own vehicle of an agent is known, it is passed as `ego_body` or `other_body` (see `BEVGlue.align`).
+        Where the own vehicle of an agent is known, it is passed as `ego_body` or `other_body`, and the other's own time
+        stamp as `other_time` (see `BEVGlue.align`).
         """
         ...
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GroupAligner", "Need", "Observation", "Pairwise"]
 
-Need = Literal["boxes", "body", "variance", "points", "features", "pose"]
+Need = Literal["boxes", "body", "variance", "points", "features", "pose", "time"]
 """Inputs of aligners; fields of `Observation`."""
 
 
@@ -39,6 +39,7 @@ class Observation:
         points: (N, 4) x, y, z [m], intensity.
         features: the detector's three maps (C, H, W).
         pose: (4, 4) world_SE3_lidar as claimed by the agent's localisation, possibly noisy or false.
+        time: the agent's own time stamp of its boxes, on any clock [s].
     """
 
     boxes: Boxes | None = None
@@ -47,6 +48,7 @@ class Observation:
     points: Float32Array | None = None
     features: tuple[Tensor, Tensor, Tensor] | None = None
     pose: FloatArray | None = None
+    time: float | None = None
 
 
 class GroupAligner(ABC):
@@ -114,7 +116,7 @@ class Pairwise(GroupAligner):
     """One aligner of boxes for each collaborator."""
 
     needs = frozenset({"boxes"})
-    accepts = frozenset({"body"})
+    accepts = frozenset({"body", "time"})
 
     def __init__(self, make_aligner: Callable[[], Aligner]) -> None:
         """Aligners are made when a collaborator first appears.
@@ -136,8 +138,10 @@ class Pairwise(GroupAligner):
             if name != ego:
                 assert other.boxes is not None
                 aligner = self._aligners.setdefault(name, self._make())
-                bodies = known_bodies(own.body, other.body)
-                found[name] = aligner.align(own.boxes, other.boxes, time, **bodies)
+                known: dict[str, Any] = known_bodies(own.body, other.body)
+                if other.time is not None:
+                    known["other_time"] = other.time
+                found[name] = aligner.align(own.boxes, other.boxes, time, **known)
         return found
 
     def reset(self) -> None:

@@ -315,7 +315,7 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
 
 @kernel(error_model="numpy")
 def _unseen_motion(h):
-    """Variances of what other's vehicle did between its list and ego's instant and its tracks do not show [m^2, rad^2]."""
+    """Variances of position and yaw from what other's vehicle did since its list and its tracks do not show."""
     change = 0.25 * h.offset**4
     return _UNSEEN_ACCELERATION**2 * change, _UNSEEN_TURN_ACCELERATION**2 * change
 

@@ -55,7 +55,7 @@ def scene_sequence(
 
     Returns:
         Frames with tracked boxes: `other` in the other's frame at the instant of its list. `ego_SE2_other` has both
-        frames at the ego's instant, `time_offset` is minus the delay of the list, and bodies are given, except a mast's.
+        frames at the ego's instant, `time_offset` is minus the delay of the list; bodies are given, except a mast's.
 
     Raises:
         ValueError: no such scene, a delay beyond 1 s or so large a jitter that lists would overtake each other.

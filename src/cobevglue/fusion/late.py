@@ -36,6 +36,6 @@ class LateFusion(FusionMethod):
         for other in received:
             rows = other.content["detections"].astype(np.float64)
             boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7])
-            parts.append(boxes.transform(other.ego_SE2_other))
+            parts.append(other.boxes_at_ego_instant(boxes))
         boxes = Boxes.concatenate(parts)
         return boxes[nms(boxes, self.detection.nms_iou)] if len(boxes) else boxes

@@ -76,7 +76,7 @@ class Path:
         last = len(self.segments) - 1
         eased: list[tuple[float, float]] = []
         for i, (length, curvature) in enumerate(self.segments):
-            before, after = (half if 0 < i else 0.0), (half if i < last else 0.0)
+            before, after = (half if i > 0 else 0.0), (half if i < last else 0.0)
             if length <= before + after and i < last:
                 raise ValueError(f"segment {i} is {length:.2f} m long, too short for transitions of {transition} m")
             eased.append((length - before - after, curvature))

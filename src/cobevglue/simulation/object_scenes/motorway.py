@@ -1,7 +1,7 @@
 """A motorway platoon: two agents in a row of vehicles, three lanes each way in a gentle bend, oncoming traffic.
 
-The order within a lane stays: each vehicle repeats the speed of the one ahead a reaction time later, and the mean speeds
-of a lane differ by a few percent at most. Some 36 vehicles are within 150 m of the platoon at any time.
+The order within a lane stays: each vehicle repeats the speed of the one ahead a reaction time later, and the mean
+speeds of a lane differ by a few percent at most. Some 36 vehicles are within 150 m of the platoon at any time.
 """
 
 from __future__ import annotations
