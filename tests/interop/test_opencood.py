@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cobevglue import SE2, Boxes
-from cobevglue.datasets.poses import SE3_from_carla, SE3_from_lidar_pose, SE3_from_SE2
+from cobevglue.datasets.poses import SE3_from_carla, SE3_from_SE2
 from cobevglue.interop import (
+    SE3_from_lidar_pose,
     boxes_from_centers,
     boxes_from_corners,
     centers_from_boxes,
@@ -92,15 +93,25 @@ def test_size_of_tilted_corners_is_kept() -> None:
 @given(
     st.tuples(*[metres] * 3),
     st.tuples(st.floats(-170, 170), st.floats(-170, 170), st.floats(-80, 80)),
+    st.booleans(),
 )
-def test_lidar_pose_round_trips(position: tuple[float, ...], angles: tuple[float, ...]) -> None:
+def test_lidar_pose_round_trips(position: tuple[float, ...], angles: tuple[float, ...], left_handed: bool) -> None:
     pose = [*position, *angles]
-    np.testing.assert_allclose(lidar_pose_from_SE3(SE3_from_lidar_pose(pose)), pose, atol=1e-9)
+    matrix = SE3_from_lidar_pose(pose, left_handed=left_handed)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+    np.testing.assert_allclose(lidar_pose_from_SE3(matrix, left_handed=left_handed), pose, atol=1e-9)
+
+
+@pytest.mark.parametrize(("left_handed", "ahead"), [(True, (5, -8)), (False, (5, 8))])
+def test_yaw_turns_x_towards_the_given_y(left_handed: bool, ahead: tuple[float, float]) -> None:
+    matrix = SE3_from_lidar_pose([5, 7, 2, 0, 90, 0], left_handed=left_handed)
+    np.testing.assert_allclose(matrix @ [1, 0, 0, 1], [*ahead, 2, 1])
 
 
 def test_lidar_pose_may_be_a_matrix() -> None:
-    left_handed = np.array([[0, -1, 0, 5], [1, 0, 0, 7], [0, 0, 1, 2], [0, 0, 0, 1.0]])  # turned right by 90 degrees
-    np.testing.assert_allclose(SE3_from_lidar_pose(left_handed), SE3_from_lidar_pose([5, 7, 2, 0, 90, 0]), atol=1e-12)
+    matrix = np.array([[0, -1, 0, 5], [1, 0, 0, 7], [0, 0, 1, 2], [0, 0, 0, 1.0]])  # turned right by 90 degrees
+    np.testing.assert_allclose(SE3_from_lidar_pose(matrix), SE3_from_lidar_pose([5, 7, 2, 0, 90, 0]), atol=1e-12)
+    np.testing.assert_allclose(SE3_from_lidar_pose(matrix, left_handed=False), matrix)
 
 
 def test_pairwise_entry_maps_row_to_column() -> None:

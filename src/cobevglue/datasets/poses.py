@@ -67,13 +67,14 @@ def carla_from_SE3(matrix: ArrayLike) -> FloatArray:
     return np.concatenate([m[..., :3, 3] * [1.0, -1.0, 1.0], angles], axis=-1)
 
 
-def SE3_from_lidar_pose(lidar_pose: ArrayLike, name: str = "lidar_pose") -> FloatArray:
+def SE3_from_lidar_pose(lidar_pose: ArrayLike, name: str = "lidar_pose", *, left_handed: bool = True) -> FloatArray:
     """Convert a stored `lidar_pose` of OPV2V's kind to a right-handed transform.
 
     Args:
-        lidar_pose: x, y, z [m], roll, yaw, pitch [degrees], or a (4, 4) matrix as in some redistributions of the data;
-            left-handed.
+        lidar_pose: x, y, z [m], roll, yaw, pitch [degrees], or a (4, 4) matrix as in some redistributions of the data.
         name: its name in error messages.
+        left_handed: the axes are CARLA's. Otherwise they are right-handed, and the angles are those that CARLA's
+            formulas give for such a matrix (CoAlign's and HEAL's DAIR-V2X).
 
     Returns:
         (4, 4) world_SE3_lidar, a proper rigid transform.
@@ -86,10 +87,10 @@ def SE3_from_lidar_pose(lidar_pose: ArrayLike, name: str = "lidar_pose") -> Floa
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} {error}") from None
     if values.shape == (4, 4):
-        return rigid_SE3(mirrored(values), name)
+        return rigid_SE3(mirrored(values) if left_handed else values, name)
     if values.shape != (6,) or not np.isfinite(values).all():
         raise ValueError(f"{name} must be six finite numbers (x, y, z, roll, yaw, pitch), got {lidar_pose}")
-    return SE3_from_carla(values)
+    return SE3_from_carla(values) if left_handed else mirrored(SE3_from_carla(values))
 
 
 def SE3_from_SE2(pose: SE2, z: float = 0.0) -> FloatArray:

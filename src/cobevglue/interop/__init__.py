@@ -17,6 +17,7 @@ from cobevglue.interop.kitti import (
 )
 from cobevglue.interop.nuscenes import SE3_from_nuscenes, boxes_from_nuscenes, nuscenes_from_boxes
 from cobevglue.interop.opencood import (
+    SE3_from_lidar_pose,
     boxes_from_centers,
     boxes_from_corners,
     centers_from_boxes,
@@ -27,6 +28,7 @@ from cobevglue.interop.opencood import (
 )
 
 __all__ = [
+    "SE3_from_lidar_pose",
     "SE3_from_nuscenes",
     "boxes_from_centers",
     "boxes_from_corners",

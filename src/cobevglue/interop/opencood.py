@@ -43,19 +43,21 @@ _CORNERS = 0.5 * np.array(
 _FRONT, _REAR, _PLUS_Y, _MINUS_Y = [0, 1, 4, 5], [2, 3, 6, 7], [1, 2, 5, 6], [0, 3, 4, 7]
 
 
-def lidar_pose_from_SE3(world_SE3_lidar: ArrayLike) -> list[float]:
+def lidar_pose_from_SE3(world_SE3_lidar: ArrayLike, *, left_handed: bool = True) -> list[float]:
     """Convert a right-handed pose to a `lidar_pose`, the inverse of `SE3_from_lidar_pose`.
 
     Args:
         world_SE3_lidar: (4, 4) proper rigid transform.
+        left_handed: see `SE3_from_lidar_pose`.
 
     Returns:
-        x, y, z [m], roll, yaw, pitch [degrees], left-handed.
+        x, y, z [m], roll, yaw, pitch [degrees].
 
     Raises:
         ValueError: the matrix is not a proper rigid transform.
     """
-    pose: list[float] = carla_from_SE3(rigid_SE3(world_SE3_lidar, "world_SE3_lidar")).tolist()
+    matrix = rigid_SE3(world_SE3_lidar, "world_SE3_lidar")
+    pose: list[float] = carla_from_SE3(matrix if left_handed else mirrored(matrix)).tolist()
     return pose
 
 
