@@ -23,7 +23,7 @@ def main() -> None:
     x, y, z, height, width, length, yaw = centers_from_boxes(CAR)[0]
     record = nuscenes_from_boxes(CAR)[0]
     kitti = kitti_from_boxes(CAR)[0]
-    quaternion = ", ".join(f"{value:.2f}" for value in record["rotation"])
+    quaternion = _row(round(value, 2) for value in record["rotation"])
     panels = [
         (
             "cobevglue",
@@ -41,7 +41,7 @@ def main() -> None:
             "nuScenes: vehicle",
             ("x", "y"),
             -1,
-            f"translation {_row(record['translation'])}\nsize (w, l, h) {_row(record['size'])}\nrotation [{quaternion}]",
+            f"translation {_row(record['translation'])}\nsize (w, l, h) {_row(record['size'])}\nrotation {quaternion}",
         ),
         (
             "KITTI: camera",
