@@ -10,13 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from cobevglue.boxes import Boxes
 from cobevglue.datasets.pcd import read_pcd
-from cobevglue.datasets.poses import SE3_from_carla, inverse_SE3, mirrored, rigid_SE3, upright_yaw
+from cobevglue.datasets.poses import SE3_from_carla, SE3_from_lidar_pose, inverse_SE3, upright_yaw
 from cobevglue.datasets.yaml_tree import LabelReader, YamlTree, read_objects
-from cobevglue.typing import ArrayLike, Float32Array, FloatArray
+from cobevglue.typing import Float32Array, FloatArray
 
 __all__ = ["OPV2V", "V2XSet", "read_opv2v_labels"]
 
@@ -57,7 +55,7 @@ def read_opv2v_labels(path: Path) -> tuple[FloatArray, Boxes]:
         ValueError: it is malformed; the message names the file, the object and the field.
     """
     lidar_pose, table = read_objects(path)
-    world_SE3_lidar = _lidar_pose(path, lidar_pose)
+    world_SE3_lidar = SE3_from_lidar_pose(lidar_pose, f"{path}: lidar_pose")
     lidar_SE3_object = inverse_SE3(world_SE3_lidar) @ SE3_from_carla(table.pose)
     try:
         boxes = Boxes(
@@ -70,16 +68,3 @@ def read_opv2v_labels(path: Path) -> tuple[FloatArray, Boxes]:
     except ValueError as error:
         raise ValueError(f"{path}: vehicles: {error}") from None
     return world_SE3_lidar, boxes
-
-
-def _lidar_pose(path: Path, lidar_pose: ArrayLike) -> FloatArray:
-    """Parse a pose of six numbers, or a 4x4 matrix as in some redistributions of the data."""
-    try:
-        values = np.asarray(lidar_pose, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: lidar_pose {error}") from None
-    if values.shape == (4, 4):
-        return rigid_SE3(mirrored(values), f"{path}: lidar_pose")
-    if values.shape != (6,) or not np.isfinite(values).all():
-        raise ValueError(f"{path}: lidar_pose must be six finite numbers (x, y, z, roll, yaw, pitch), got {lidar_pose}")
-    return SE3_from_carla(values)

@@ -10,9 +10,20 @@ from __future__ import annotations
 import numpy as np
 
 from cobevglue.boxes import Boxes
+from cobevglue.se2 import SE2
 from cobevglue.typing import ArrayLike, FloatArray
 
-__all__ = ["SE3_from_carla", "carla_from_SE3", "inverse_SE3", "mirrored", "rigid_SE3", "transform_boxes", "upright_yaw"]
+__all__ = [
+    "SE3_from_SE2",
+    "SE3_from_carla",
+    "SE3_from_lidar_pose",
+    "carla_from_SE3",
+    "inverse_SE3",
+    "mirrored",
+    "rigid_SE3",
+    "transform_boxes",
+    "upright_yaw",
+]
 
 
 def SE3_from_carla(pose: ArrayLike) -> FloatArray:
@@ -54,6 +65,40 @@ def carla_from_SE3(matrix: ArrayLike) -> FloatArray:
     yaw = np.arctan2(m[..., 1, 0], m[..., 0, 0])
     angles = np.rad2deg(np.stack([roll, -yaw, -pitch], axis=-1))
     return np.concatenate([m[..., :3, 3] * [1.0, -1.0, 1.0], angles], axis=-1)
+
+
+def SE3_from_lidar_pose(lidar_pose: ArrayLike, name: str = "lidar_pose", *, left_handed: bool = True) -> FloatArray:
+    """Convert a stored `lidar_pose` of OPV2V's kind to a right-handed transform.
+
+    Args:
+        lidar_pose: x, y, z [m], roll, yaw, pitch [degrees], or a (4, 4) matrix as in some redistributions of the data.
+        name: its name in error messages.
+        left_handed: the axes are CARLA's. Otherwise they are right-handed, and the angles are those that CARLA's
+            formulas give for such a matrix (CoAlign's and HEAL's DAIR-V2X).
+
+    Returns:
+        (4, 4) world_SE3_lidar, a proper rigid transform.
+
+    Raises:
+        ValueError: neither six finite numbers nor a rigid (4, 4) matrix.
+    """
+    try:
+        values = np.asarray(lidar_pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} {error}") from None
+    if values.shape == (4, 4):
+        return rigid_SE3(mirrored(values) if left_handed else values, name)
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be six finite numbers (x, y, z, roll, yaw, pitch), got {lidar_pose}")
+    return SE3_from_carla(values) if left_handed else mirrored(SE3_from_carla(values))
+
+
+def SE3_from_SE2(pose: SE2, z: float = 0.0) -> FloatArray:
+    """(4, 4) spatial transform of a planar one, at height `z` [m], without roll and pitch."""
+    matrix = np.eye(4)
+    matrix[:2, :2] = pose.rotation
+    matrix[:3, 3] = pose.x, pose.y, z
+    return matrix
 
 
 def mirrored(matrix: ArrayLike) -> FloatArray:

@@ -17,7 +17,9 @@ from cobevglue.boxes import Boxes
 from cobevglue.datasets.v2v4real import LEFT_HANDED
 
 __all__ = [
+    "TextBox",
     "count_frames",
+    "kitti_box",
     "read_kitti_detections",
     "read_kitti_labels",
     "read_v2v4real_detections",
@@ -27,14 +29,16 @@ __all__ = [
 _DETECTED_KINDS = {1: "pedestrian", 2: "car", 3: "cyclist"}
 
 
-class _Box(NamedTuple):
+class TextBox(NamedTuple):
+    """One box of a text file, in the axes of the package: centre and size [m], yaw [rad]."""
+
     center: tuple[float, float, float]
     size: tuple[float, float, float]
     yaw: float
 
 
 class _Row(NamedTuple):
-    box: _Box
+    box: TextBox
     score: float | None
     track_id: int | None
     label: str
@@ -106,7 +110,7 @@ def read_kitti_detections(path: str | Path, frame_count: int | None = None) -> l
         FileNotFoundError: the file does not exist.
         ValueError: a malformed line, or a frame beyond `frame_count`; the message names the file and the line.
     """
-    return _read_detections(path, _kitti_box, frame_count)
+    return _read_detections(path, kitti_box, frame_count)
 
 
 def read_kitti_labels(
@@ -128,26 +132,27 @@ def read_kitti_labels(
         FileNotFoundError: the file does not exist.
         ValueError: a malformed line or an id repeated in a frame; the message names the file and the line.
     """
-    return _read_labels(path, _kitti_box, frame_count, {name.lower() for name in classes})
+    return _read_labels(path, kitti_box, frame_count, {name.lower() for name in classes})
 
 
 def _v2v4real_box(
     left_handed: bool, height: float, width: float, length: float, x: float, z: float, y: float, yaw: float
-) -> _Box:
+) -> TextBox:
     side = -1.0 if left_handed else 1.0
-    return _Box((x, side * y, z), (length, width, height), side * yaw)
+    return TextBox((x, side * y, z), (length, width, height), side * yaw)
 
 
-def _kitti_box(height: float, width: float, length: float, x: float, y: float, z: float, rotation_y: float) -> _Box:
-    """Convert from camera axes: x right, y down, z forward; the location is the centre of the bottom of the box.
+def kitti_box(height: float, width: float, length: float, x: float, y: float, z: float, rotation_y: float) -> TextBox:
+    """Convert a box from KITTI's camera coordinates to the frame at the camera with x forward, y left, z up.
 
+    Camera axes are x right, y down, z forward; the location is the centre of the bottom of the box.
     At rotation_y = 0 the heading is along camera x; positive angles rotate it from x to -z. The heading is thus
     (cos, -sin) in camera x and z, which is (-sin, -cos) forward and left.
     """
-    return _Box((z, -x, -y + height / 2), (length, width, height), -rotation_y - math.pi / 2)
+    return TextBox((z, -x, -y + height / 2), (length, width, height), -rotation_y - math.pi / 2)
 
 
-def _read_detections(path: str | Path, box: Callable[..., _Box], frame_count: int | None) -> list[Boxes]:
+def _read_detections(path: str | Path, box: Callable[..., TextBox], frame_count: int | None) -> list[Boxes]:
     """`box` converts the seven numbers from the height on to a box."""
 
     def parse(words: list[str]) -> _Row:
@@ -158,7 +163,7 @@ def _read_detections(path: str | Path, box: Callable[..., _Box], frame_count: in
 
 
 def _read_labels(
-    path: str | Path, box: Callable[..., _Box], frame_count: int | None, classes: Collection[str] | None = None
+    path: str | Path, box: Callable[..., TextBox], frame_count: int | None, classes: Collection[str] | None = None
 ) -> list[Boxes]:
     """`box` converts the seven numbers from the height on to a box; `classes` in lower case, None for all."""
 

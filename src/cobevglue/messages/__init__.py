@@ -1,4 +1,7 @@
-"""What travels between agents: the object message and arrays in bytes, and the object list as a JSON file."""
+"""What travels between agents: the object message and arrays in bytes, and the object list as a JSON file.
+
+`cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message.
+"""
 
 from cobevglue.messages.array_message import Arrays, decode_arrays, encode_arrays
 from cobevglue.messages.object_list import from_dict, read_object_list, to_dict, write_object_list

@@ -1,0 +1,364 @@
+"""ETSI's Collective Perception Message (CPM, TS 103 324 V2.1.1) in place of our own object message.
+
+    data = encode(CollectivePerception(station_id=7, time=t, boxes=boxes, heading=yaw_from_east))
+    decode(data).boxes  # in the sender's frame again
+
+The types are in `cpm.asn`, encoded in unaligned PER. Needs: pip install 'cobevglue[cpm]'
+
+How the fields are filled:
+
+| field of the standard | content | unit |
+|---|---|---|
+| referenceTime | `time` | 1 ms |
+| referencePosition | `latitude`, `longitude`, `altitude` of the frame's origin | 1e-7 degree, 0.01 m |
+| orientationAngle | `heading`, clockwise from north there; of vehicles only | 0.1 degree |
+| objectId | track id modulo 65535, which the standard requires; 65535 is the sender's own vehicle | |
+| measurementDeltaTime | `measurement_offset` | 1 ms |
+| position | box centre east, north and above of the reference position | 0.01 m, up to 1310.7 m |
+| velocity | `velocity`, east and north | 0.01 m/s |
+| zAngle | yaw, counter-clockwise from east | 0.1 degree |
+| objectDimensionX, Y, Z | length, width, height; a height of 0 (unknown) is left out | 0.1 m, up to 25.4 m |
+| objectAge | `age`; 1.5 s for more | 1 ms |
+| objectPerceptionQuality | score | 1/15 |
+| classification | label | |
+
+- Values are rounded to the nearest multiple of their unit. The standard's tables round up, which gives a receiver that
+  multiplies by the unit, as receivers do, a bias of half a unit.
+- Objects are turned by the heading as it is sent (to 0.1 degree), so that the receiver restores the sender's frame
+  without an error from the heading's rounding.
+- **Without GNSS**: latitude, longitude and `heading` of None are sent as unavailable, and coordinates are along the
+  sender's own axes. No receiver can place such a list on a map; BEVGlue does not need to.
+- A roadside unit has no heading in the standard. Its boxes arrive in axes east and north, with `heading` 0.
+- The standard has no box of the sender itself in a CPM (its size is in the CAM). `body` is sent as one more object with
+  the id 65535 that stands on the reference position; other receivers see an object where the sender is.
+- Objects of other senders without length, width or zAngle are no boxes: they are counted in `omitted`.
+- One message holds at most 255 objects; segmentation is not implemented. A CPM has no checksum: integrity is up to the
+  signature around it (TS 103 097).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cobevglue.boxes import Boxes, covers_origin
+from cobevglue.messages.cpm_objects import Columns, objects_from_columns, read_objects
+from cobevglue.messages.cpm_schema import decode_type, encode_type, has_spare_bytes
+from cobevglue.messages.object_message import MessageError, ObjectMessage
+from cobevglue.typing import ArrayLike, FloatArray
+
+__all__ = ["MAX_OBJECTS", "OWN_VEHICLE", "SENSOR_TYPES", "CollectivePerception", "decode", "encode"]
+
+MAX_OBJECTS = 255
+"""Most objects of one message, the own vehicle included."""
+OWN_VEHICLE = 65535
+"""objectId of the sender's own vehicle; track ids are taken modulo this number."""
+SENSOR_TYPES = (
+    "undefined", "radar", "lidar", "monovideo", "stereovision", "nightvision", "ultrasonic", "pmd", "inductionLoop",
+    "sphericalCamera", "uwb", "acoustic", "localAggregation", "itsAggregation",
+)  # fmt: skip
+"""Names of the standard's sensor types, by number."""
+
+_PROTOCOL_VERSION, _CPM = 2, 14
+_VEHICLE, _ROADSIDE, _SENSORS, _OBJECTS = 1, 2, 3, 5
+_MAX_TIME = (2**42 - 1) / 1000.0
+_NO_LATITUDE, _NO_LONGITUDE, _NO_ALTITUDE, _NO_ANGLE = 900_000_001, 1_800_000_001, 800_001, 3601
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CollectivePerception:
+    """What one agent saw at one time, as a CPM holds it.
+
+    Attributes:
+        station_id: the sender, 0 to 2^32 - 1.
+        time: of the list [s], 0 to 4.4e9: since 2004-01-01 UTC with leap seconds counted (5 s ahead of UTC since 2017),
+            or the clock of a simulation.
+        boxes: the objects in the sender's own frame, with `track_id`. Scores must be within 0 and 1.
+        body: one-row box of the sender's own vehicle in the same frame, which stands on its origin; or None.
+        heading: yaw of the frame's x axis, counter-clockwise from east [rad]; None for unknown.
+        latitude: of the frame's origin [degrees]; None for unknown.
+        longitude: likewise.
+        altitude: likewise [m].
+        is_infrastructure: whether the sender is a roadside unit.
+        velocity: (N, 2) velocities over ground along the axes of the frame [m/s], NaN where unknown; or None.
+        age: (N,) for how long the objects have been observed [s], NaN where unknown; or None.
+        measurement_offset: (N,) when the objects were measured, relative to `time` [s]; None for at `time`.
+        position_std: (N,) standard deviations of x and y [m], NaN where unknown; or None. Sent as the 95 % interval.
+        yaw_std: (N,) likewise of the yaw [rad].
+        sensor_type: a name in `SENSOR_TYPES`, or None to send no sensor information. Not read from received messages.
+        omitted: objects of a received message that had no size or heading.
+
+    Raises:
+        MessageError: a field is outside of its limits; it names the field and the row.
+    """
+
+    station_id: int
+    time: float
+    boxes: Boxes
+    body: Boxes | None = None
+    heading: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude: float | None = None
+    is_infrastructure: bool = False
+    velocity: FloatArray | None = None
+    age: FloatArray | None = None
+    measurement_offset: FloatArray | None = None
+    position_std: FloatArray | None = None
+    yaw_std: FloatArray | None = None
+    sensor_type: str | None = "lidar"
+    omitted: int = 0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.station_id, bool) or not isinstance(self.station_id, (int, np.integer)):
+            raise MessageError(f"station_id must be a whole number, got {self.station_id!r}")
+        _check_range("station_id", self.station_id, 0, 2**32 - 1)
+        _check_range("time", self.time, 0.0, _MAX_TIME)
+        for name, limit in (("latitude", 90.0), ("longitude", 180.0), ("heading", math.inf)):
+            if getattr(self, name) is not None:
+                _check_range(name, getattr(self, name), -limit, limit)
+        if self.altitude is not None:
+            _check_range("altitude", self.altitude, -1000.0, 8000.0)
+        if not isinstance(self.boxes, Boxes):
+            raise MessageError(f"boxes must be Boxes, got {type(self.boxes).__name__}")
+        if self.body is not None and (not isinstance(self.body, Boxes) or len(self.body) != 1):
+            raise MessageError(f"body must be Boxes with one row, got {self.body!r}")
+        if len(self.boxes) + (self.body is not None) > MAX_OBJECTS:
+            raise MessageError(f"boxes: {len(self.boxes)} objects, a CPM holds at most {MAX_OBJECTS} with the body")
+        if self.sensor_type is not None and self.sensor_type not in SENSOR_TYPES:
+            raise MessageError(f"sensor_type must be one of {', '.join(SENSOR_TYPES)}, got {self.sensor_type!r}")
+        n = len(self.boxes)
+        for name, shape in (
+            ("velocity", (n, 2)),
+            ("age", (n,)),
+            ("measurement_offset", (n,)),
+            ("position_std", (n,)),
+            ("yaw_std", (n,)),
+        ):
+            object.__setattr__(self, name, _column(name, getattr(self, name), shape))
+
+    @property
+    def agent_id(self) -> str:
+        """The sender, as in an `ObjectMessage`: the station id as text."""
+        return str(self.station_id)
+
+    @classmethod
+    def from_message(cls, message: ObjectMessage, **fields: Any) -> CollectivePerception:
+        """The CPM of an object message.
+
+        Args:
+            message: its agent id is the station id as text, unless `station_id` is given.
+            fields: further fields, such as `heading` and `velocity`.
+
+        Raises:
+            MessageError: the agent id is not a number, or a field is outside of its limits.
+        """
+        if "station_id" not in fields:
+            if not (message.agent_id.isascii() and message.agent_id.isdigit()):
+                raise MessageError(f"agent_id must be a station id, 0 to 2^32 - 1, got {message.agent_id!r}")
+            fields["station_id"] = int(message.agent_id)
+        return cls(time=message.time, boxes=message.boxes, body=message.body, **fields)
+
+    def object_message(self, frame: int = 0) -> ObjectMessage:
+        """The object message of this CPM; a CPM has no frame count, so the caller gives it."""
+        return ObjectMessage(self.agent_id, self.time, frame, self.boxes, self.body)
+
+
+def encode(message: CollectivePerception) -> bytes:
+    """The bytes of a CPM.
+
+    Raises:
+        MessageError: a field that the standard requires is missing, or a value is out of its range; it names field and
+            row.
+        ModuleNotFoundError: asn1tools is not installed.
+    """
+    if message.is_infrastructure and message.heading is None:
+        raise MessageError("heading: a roadside unit must know it, since its CPM cannot say that it is unknown")
+    angle, orientation = _sent_heading(message)
+    objects = objects_from_columns(_columns(message), angle)
+    containers = [(_ROADSIDE, encode_type("OriginatingRsuContainer", {}))]
+    if not message.is_infrastructure:
+        container = {"orientationAngle": {"value": orientation, "confidence": 127}}
+        containers = [(_VEHICLE, encode_type("OriginatingVehicleContainer", container))]
+    if message.sensor_type is not None:
+        sensor = {"sensorId": 1, "sensorType": SENSOR_TYPES.index(message.sensor_type), "shadowingApplies": False}
+        containers.append((_SENSORS, encode_type("SensorInformationContainer", [sensor])))
+    perceived = {"numberOfPerceivedObjects": len(objects), "perceivedObjects": objects}
+    containers.append((_OBJECTS, encode_type("PerceivedObjectContainer", perceived)))
+    payload = {
+        "managementContainer": {
+            "referenceTime": round(1000.0 * message.time),
+            "referencePosition": _reference_position(message),
+        },
+        "cpmContainers": [{"containerId": number, "containerData": data} for number, data in containers],
+    }
+    header = {"protocolVersion": _PROTOCOL_VERSION, "messageId": _CPM, "stationId": int(message.station_id)}
+    return encode_type("CollectivePerceptionMessage", {"header": header, "payload": payload})
+
+
+def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
+    """The CPM in these bytes.
+
+    Sensor information, perception regions, and what of an object `CollectivePerception` does not hold, are skipped.
+
+    Raises:
+        MessageError: these are not exactly one CPM with valid boxes; it says why.
+        ModuleNotFoundError: asn1tools is not installed.
+    """
+    if not isinstance(data, (bytes, bytearray, memoryview)):
+        raise MessageError(f"a message is bytes, got {type(data).__name__}")
+    data = bytes(data)
+    whole = decode_type("CollectivePerceptionMessage", data)
+    if has_spare_bytes("CollectivePerceptionMessage", data):
+        raise MessageError(f"oversized: {len(data)} bytes, the CPM ends before")
+    header, payload = whole["header"], whole["payload"]
+    if (header["protocolVersion"], header["messageId"]) != (_PROTOCOL_VERSION, _CPM):
+        raise MessageError(
+            f"not a CPM of version {_PROTOCOL_VERSION}: it has messageId {header['messageId']} and protocolVersion "
+            f"{header['protocolVersion']}"
+        )
+    containers: dict[int, bytes] = {}
+    for container in payload["cpmContainers"]:
+        if container["containerId"] in containers:
+            raise MessageError(f"container {container['containerId']} comes twice")
+        containers[container["containerId"]] = container["containerData"]
+    if _VEHICLE in containers and _ROADSIDE in containers:
+        raise MessageError("the sender is a vehicle and a roadside unit at once")
+    heading: float | None = 0.0
+    if _ROADSIDE not in containers:
+        heading = _received_heading(containers.get(_VEHICLE))
+    objects = []
+    if _OBJECTS in containers:
+        objects = decode_type("PerceivedObjectContainer", containers[_OBJECTS])["perceivedObjects"]
+    try:
+        columns, omitted = read_objects(objects, heading or 0.0)
+    except ValueError as error:
+        raise MessageError(f"invalid boxes: {error}") from None
+    columns, body = _split_body(columns)
+    management = payload["managementContainer"]
+    position = management["referencePosition"]
+    return CollectivePerception(
+        station_id=header["stationId"],
+        time=management["referenceTime"] / 1000.0,
+        boxes=columns.boxes,
+        body=body,
+        heading=heading,
+        latitude=_known(position["latitude"], _NO_LATITUDE, 1e-7),
+        longitude=_known(position["longitude"], _NO_LONGITUDE, 1e-7),
+        altitude=_known(position["altitude"]["altitudeValue"], _NO_ALTITUDE, 0.01),
+        is_infrastructure=_ROADSIDE in containers,
+        velocity=columns.velocity,
+        age=columns.age,
+        measurement_offset=columns.measurement_offset,
+        position_std=columns.position_std,
+        yaw_std=columns.yaw_std,
+        sensor_type=None,
+        omitted=omitted,
+    )
+
+
+def _sent_heading(message: CollectivePerception) -> tuple[float, int]:
+    """The angle by which objects are turned to the axes of the message [rad], and the orientationAngle."""
+    if message.heading is None:
+        return 0.0, _NO_ANGLE
+    if message.is_infrastructure:
+        return message.heading, _NO_ANGLE
+    orientation = round(900.0 - 10.0 * math.degrees(message.heading)) % 3600
+    return _heading_of(orientation), orientation
+
+
+def _received_heading(vehicle: bytes | None) -> float | None:
+    if vehicle is None:
+        return None
+    orientation = decode_type("OriginatingVehicleContainer", vehicle)["orientationAngle"]["value"]
+    return None if orientation == _NO_ANGLE else _heading_of(orientation)
+
+
+def _heading_of(orientation: int) -> float:
+    """From tenths of degrees clockwise from north to radians counter-clockwise from east, in (-pi, pi]."""
+    tenths = (900 - orientation) % 3600
+    return math.radians((tenths - 3600 if tenths > 1800 else tenths) / 10.0)
+
+
+def _reference_position(message: CollectivePerception) -> dict[str, Any]:
+    altitude = _NO_ALTITUDE if message.altitude is None else round(100.0 * message.altitude)
+    return {
+        "latitude": _NO_LATITUDE if message.latitude is None else round(1e7 * message.latitude),
+        # -180 degrees itself is reserved.
+        "longitude": _NO_LONGITUDE
+        if message.longitude is None
+        else max(round(1e7 * message.longitude), -1_799_999_999),
+        "positionConfidenceEllipse": {
+            "semiMajorConfidence": 4095,
+            "semiMinorConfidence": 4095,
+            "semiMajorOrientation": _NO_ANGLE,
+        },
+        "altitude": {"altitudeValue": altitude, "altitudeConfidence": "unavailable"},
+    }
+
+
+def _columns(message: CollectivePerception) -> Columns:
+    """The objects and, as the last one, the own vehicle."""
+    boxes = message.boxes
+    if len(boxes) and boxes.track_id is None:
+        raise MessageError("boxes must have a track_id, since the standard requires objectId: use a tracker")
+    ids = np.zeros(0, np.int64) if boxes.track_id is None else boxes.track_id
+    if (ids < 0).any():
+        raise MessageError(f"track_id: row {int((ids < 0).argmax())} is {int(ids.min())}, ids must be >= 0")
+    ids = ids % OWN_VEHICLE
+    if len(np.unique(ids)) < len(ids):
+        raise MessageError(f"track_id: two ids are the same modulo {OWN_VEHICLE}")
+    columns = Columns(
+        boxes.replace(track_id=ids),
+        message.velocity,
+        message.age,
+        message.measurement_offset,
+        message.position_std,
+        message.yaw_std,
+    )
+    if message.body is None:
+        return columns
+    if not covers_origin(message.body)[0]:
+        raise MessageError("body must stand on the origin of the frame, the reference position")
+    return columns.with_own_vehicle(message.body, OWN_VEHICLE)
+
+
+def _split_body(columns: Columns) -> tuple[Columns, Boxes | None]:
+    """Separate the own vehicle: the object with its id, if it stands on the reference position."""
+    ids = columns.boxes.track_id
+    if ids is None:
+        return columns, None
+    own = (ids == OWN_VEHICLE) & covers_origin(columns.boxes)
+    if not own.any():
+        return columns, None
+    body = columns.boxes[own]
+    return columns[~own], Boxes(body.center, body.size, body.yaw)
+
+
+def _known(value: int, unavailable: int, unit: float) -> float | None:
+    return None if value == unavailable else value * unit
+
+
+def _check_range(name: str, value: Any, low: float, high: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
+        raise MessageError(f"{name} must be a finite number, got {value!r}")
+    if not low <= value <= high:
+        raise MessageError(f"{name} must be from {low} to {high}, got {value}")
+
+
+def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray | None:
+    if values is None:
+        return None
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MessageError(f"{name} must be numbers of shape {shape}: {error}") from None
+    if array.size == 0 and shape[0] == 0:
+        array = array.reshape(shape)
+    if array.shape != shape:
+        raise MessageError(f"{name} must have shape {shape}, got {array.shape}")
+    array.setflags(write=False)
+    return array
