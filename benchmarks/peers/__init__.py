@@ -1,6 +1,7 @@
 """Matchers of other papers on BEVGlue's input, each written from its paper, for `benchmarks/alignment.py --only peers`.
 
-They are no part of the package. None is given a pose, a trajectory or tracks; those that expect a rough pose run without.
+They are no part of the package. None is given a pose, a trajectory or tracks; those that expect a rough pose run
+without.
 """
 
 from __future__ import annotations

@@ -1,18 +1,19 @@
 """CBM, context-based matching: boxes that see the same surroundings, and the matches that vouch for each other.
 
-Song et al., "A Spatial Calibration Method for Robust Cooperative Perception" (arXiv:2304.12033), Algorithm 1. The abstract and a
-description of the released code were at hand, not the equations.
+Song et al., "A Spatial Calibration Method for Robust Cooperative Perception" (arXiv:2304.12033), Algorithm 1. The
+abstract and a description of the released code were at hand, not the equations.
 
-As described: the context of a box is the positions of all others in its own frame (heading forward). Two boxes' contexts are
-matched where the directions differ by at most sigma 1 and the positions by at most sigma 2 (L1). Each such local matching is then
-judged by its members ("onlookers"), and matches without global consensus are dropped, as are rows and columns with more
-than one match. The largest matching gives the pose by SVD; one whose boxes are too far apart is rejected.
+As described: the context of a box is the positions of all others in its own frame (heading forward). Two boxes'
+contexts are matched where the directions differ by at most sigma 1 and the positions by at most sigma 2 (L1). Each such
+local matching is then judged by its members ("onlookers"), and matches without global consensus are dropped, as are
+rows and columns with more than one match. The largest matching gives the pose by SVD; one whose boxes are too far apart
+is rejected.
 
 Filled in or left out:
 
-- The paper starts from a rough pose: headings are folded to (-90, 90] degrees, which is safe only if both agents' frames
-  point the same way. Here there is none. Headings count modulo pi, too, but a pair of boxes is tried with both of its contexts,
-  and an onlooker votes with the one that agrees.
+- The paper starts from a rough pose: headings are folded to (-90, 90] degrees, which is safe only if both agents'
+  frames point the same way. Here there is none. Headings count modulo pi, too, but a pair of boxes is tried with both
+  of its contexts, and an onlooker votes with the one that agrees.
 - How onlookers vote: a match stays if at least `consensus` of the members of the local matching have it in theirs.
 - The distance by which a matching is rejected is that of the centres after the pose's own fit.
 - Of equally large matchings the one with the smallest distance wins (in the released code the last one).
@@ -57,6 +58,11 @@ class CBM(SingleFrameMatcher):
     max_distance: float = 20.0
     min_matches: int = 2
 
+    @classmethod
+    def published(cls) -> CBM:
+        """The tolerances of the released code; consensus and the least number of matches are ours."""
+        return cls(math.radians(10.0), position=3.0, consensus=0.5, max_distance=20.0, min_matches=2)
+
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The pose of the largest matching with consensus."""
         best = Alignment.refused("no two contexts agree")
@@ -84,7 +90,7 @@ class CBM(SingleFrameMatcher):
         alone = (in_row[seed * m + row] == 1) & (in_column[seed * n + column] == 1)
         seed, row, column = seed[alone], row[alone], column[alone]
         count = np.bincount(seed, minlength=len(size))
-        largest = np.flatnonzero(count == count.max()) if count.max() >= 2 else []
+        largest = np.flatnonzero(count == max(count.max(), 2))
         found = {tuple(map(tuple, np.column_stack([row[seed == s], column[seed == s]]).tolist())) for s in largest}
         return [np.array(sorted(matches)) for matches in sorted(found)]
 

@@ -1,22 +1,24 @@
 """CLIPPER: the densest set of consistent associations, by projected gradient ascent.
 
-Lusk, Fathian, How, "CLIPPER: A Graph-Theoretic Framework for Robust Data Association" (ICRA 2021, arXiv:2011.10202), and Lusk,
-How, "CLIPPER: Robust Data Association without an Initial Guess" (RA-L 2024, arXiv:2402.07284): the densest edge-weighted
-clique and its first-order relaxation. Its own bindings are not on PyPI and have to be built from source, so this follows the
-papers, of which only the abstracts were at hand.
+Lusk, Fathian, How, "CLIPPER: A Graph-Theoretic Framework for Robust Data Association" (ICRA 2021, arXiv:2011.10202),
+and Lusk, How, "CLIPPER: Robust Data Association without an Initial Guess" (RA-L 2024, arXiv:2402.07284): the densest
+edge-weighted clique and its first-order relaxation. Its own bindings are not on PyPI and have to be built from source,
+so this follows the papers, of which only the abstracts were at hand.
 
-Associations are the nodes of a graph: all pairs of boxes, one of each agent. The affinity of two is exp(-c^2 / 2 sigma^2),
-with c the difference of the distances between the boxes, and 0 where c exceeds epsilon or where they share a box. u' M u over
-u >= 0, |u| <= 1 is maximised by projected gradient ascent with backtracking, where inconsistent associations are charged
-with a penalty d that grows until none is left together. omega = round(u' M u) associations with the largest u are selected, and
-give the pose by SVD.
+Associations are the nodes of a graph: all pairs of boxes, one of each agent. The affinity of two is exp(-c^2 / 2
+sigma^2), with c the difference of the distances between the boxes, and 0 where c exceeds epsilon or where they share a
+box. u' M u over u >= 0, |u| <= 1 is maximised by projected gradient ascent with backtracking, where inconsistent
+associations are charged with a penalty d that grows until none is left together. omega = round(u' M u) associations
+with the largest u are selected, and give the pose by SVD.
 
 Filled in:
 
-- CLIPPER takes any invariant. `heading` adds a second one: the angle between two headings, modulo pi. It also rules out most
-  mirrored sets, which distances do not.
-- The start is M 1 rather than random, and the penalty grows by the smallest ratio that makes an inconsistent association fall.
-- Associations with fewer than `min_matches` - 1 consistent ones are removed first: they are in no clique that is accepted.
+- CLIPPER takes any invariant. `heading` adds a second one: the angle between two headings, modulo pi. It also rules out
+  most mirrored sets, which distances do not.
+- The start is M 1 rather than random, and the penalty grows by the smallest ratio that makes an inconsistent
+  association fall.
+- Associations with fewer than `min_matches` - 1 consistent ones are removed first: they are in no clique that is
+  accepted.
 - The smallest number of matches.
 
 Settings: `PYTHONPATH=benchmarks python -m peers.search Clipper` (see `peers/search.py`).
@@ -63,6 +65,11 @@ class Clipper(SingleFrameMatcher):
     heading: float = math.pi / 2
     min_matches: int = 2
 
+    @classmethod
+    def published(cls) -> Clipper:
+        """The defaults of its own library, for points known to centimetres, and distances only."""
+        return cls(sigma=0.01, epsilon=0.06, min_distance=0.0, heading=math.pi / 2, min_matches=2)
+
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The pose of the densest clique."""
         affinity = self._affinity(ego, other)
@@ -90,9 +97,8 @@ class Clipper(SingleFrameMatcher):
         consistent &= same[:, :, None, None] & same[None, None, :, :]
         consistent[np.arange(m), :, np.arange(m), :] = False
         consistent[:, np.arange(n), :, np.arange(n)] = False
-        affinity: FloatArray = np.where(consistent, np.exp(-(gap**2) / (2.0 * self.sigma**2)), 0.0).reshape(
-            m * n, m * n
-        )
+        values = np.where(consistent, np.exp(-(gap**2) / (2.0 * self.sigma**2)), 0.0)
+        affinity: FloatArray = values.reshape(m * n, m * n)
         np.fill_diagonal(affinity, 1.0)
         return affinity
 

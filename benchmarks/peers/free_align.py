@@ -5,18 +5,18 @@ arXiv:2405.02965). The method section has three parts: salient-object graph lear
 (MASS), and the pose from the matched boxes. The text was not at hand while this was written, only its abstract and a
 description of what its released matcher does, so there are no equation numbers.
 
-As described: nodes are boxes, edges their distances. Every pair of boxes (one of each agent) seeds an anchor set; the pair
-whose distances agree best joins as long as it agrees with *all* anchors; then further pairs that agree with all anchors
-join with a wider tolerance. Of all sets, the one with the lowest (100 + sum of gaps) / size^2 wins. Fewer than
+As described: nodes are boxes, edges their distances. Every pair of boxes (one of each agent) seeds an anchor set; the
+pair whose distances agree best joins as long as it agrees with *all* anchors; then further pairs that agree with all
+anchors join with a wider tolerance. Of all sets, the one with the lowest (100 + sum of gaps) / size^2 wins. Fewer than
 `min_anchors` anchors or no more than `min_anchors` nodes are refused. No headings, sizes or tracks.
 
 Filled in or left out:
 
 - Edge features are the distances themselves. The paper learns them with a graph attention network; the released matcher
   does not use one.
-- The released pose is a RANSAC fit of a similarity, which can change the scale. Here it is rigid: of all pairs of matches, the
-  one whose pose most matches agree with, then least squares over those. Matches that disagree are dropped before the
-  refusal, so that a mirrored set is refused.
+- The released pose is a RANSAC fit of a similarity, which can change the scale. Here it is rigid: of all pairs of
+  matches, the one whose pose most matches agree with, then least squares over those. Matches that disagree are dropped
+  before the refusal, so that a mirrored set is refused.
 - The search over the collaborator's past lists (time delay) is left out, as is the learned initial similarity of nodes.
 
 Settings: `PYTHONPATH=benchmarks python -m peers.search FreeAlign` (see `peers/search.py`).
@@ -52,6 +52,11 @@ class FreeAlign(SingleFrameMatcher):
     box_tolerance: float = 0.5
     min_anchors: int = 3
     inlier_distance: float = 2.0
+
+    @classmethod
+    def published(cls) -> FreeAlign:
+        """The tolerances of the released matcher; the distance of inliers is ours."""
+        return cls(anchor_tolerance=0.6, box_tolerance=0.5, min_anchors=3, inlier_distance=2.0)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The pose of the best common subgraph."""

@@ -13,7 +13,12 @@ __all__ = ["SingleFrameMatcher", "distances", "pose_of_matches", "same_class"]
 
 
 class SingleFrameMatcher:
-    """An `Aligner` without memory. Subclasses implement `match`."""
+    """An `Aligner` without memory. Subclasses implement `match` and `published`; their defaults were searched."""
+
+    @classmethod
+    def published(cls) -> SingleFrameMatcher:
+        """The matcher with the settings of its paper or code, where they are known."""
+        raise NotImplementedError
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The relative pose of two lists of at least two boxes each."""

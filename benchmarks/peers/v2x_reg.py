@@ -1,22 +1,22 @@
 """V2X-Reg++'s matcher: each pair of boxes fixes a pose, and the poses that bring many boxes together win.
 
 Qu et al., "V2I-Calib++: An Online Spatial Calibration Approach for Multi-end LiDAR in Urban Intersections"
-(arXiv:2410.11008, later named V2X-Reg++), after "V2I-Calib" (IROS 2024, arXiv:2407.10195): the association of objects by the
-overall distance (oDist), the affinity matrix with an assignment over it, and the weighted SVD. The abstract and a description
-of the released code were at hand, not the equations.
+(arXiv:2410.11008, later named V2X-Reg++), after "V2I-Calib" (IROS 2024, arXiv:2407.10195): the association of objects
+by the overall distance (oDist), the affinity matrix with an assignment over it, and the weighted SVD. The abstract and
+a description of the released code were at hand, not the equations.
 
 As described: for each pair of boxes of one class, the pose that puts one on the other (by their corners, so with the
-heading) moves all other boxes; boxes are assigned by centre distance and by mean corner distance, and those below a threshold
-counted. Mean of the two counts minus one: the affinity of the pair. The assignment of largest affinity is found; pairs
-below a threshold are dropped, and while the best affinity is small only the best pairs are kept. A weighted SVD over all their
-corners gives the pose.
+heading) moves all other boxes; boxes are assigned by centre distance and by mean corner distance, and those below a
+threshold counted. Mean of the two counts minus one: the affinity of the pair. The assignment of largest affinity is
+found; pairs below a threshold are dropped, and while the best affinity is small only the best pairs are kept. A
+weighted SVD over all their corners gives the pose.
 
 Filled in or left out:
 
 - Only from above: four corners, SE(2).
 - Boxes that are too far apart are excluded from the assignment, rather than dropped after it.
-- Headings off by half a turn (an option of the released code): every pair is tried turned by pi as well, and corners are
-  compared in both orders.
+- Headings off by half a turn (an option of the released code): every pair is tried turned by pi as well, and corners
+  are compared in both orders.
 - One threshold for all classes, since the lists of the benchmark have only one.
 
 Settings: `PYTHONPATH=benchmarks python -m peers.search V2XReg` (see `peers/search.py`).
@@ -57,6 +57,11 @@ class V2XReg(SingleFrameMatcher):
     min_affinity: float = 4.0
     few: float = 5.0
     half_turns: bool = False
+
+    @classmethod
+    def published(cls) -> V2XReg:
+        """The settings of the paper and its released code."""
+        return cls(max_boxes=25, distance=1.0, min_affinity=4.0, few=5.0, half_turns=False)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The pose of the pairs with the largest affinities."""

@@ -1,19 +1,20 @@
 """VIPS' matcher: spectral graph matching of boxes and their distances and headings.
 
 Shi et al., "VIPS: Real-Time Perception Fusion for Infrastructure-Assisted Autonomous Driving" (MobiCom 2022), the graph
-matching part. The text was not at hand while this was written, only a description of an unofficial implementation, so there
-are no equation numbers.
+matching part. The text was not at hand while this was written, only a description of an unofficial implementation, so
+there are no equation numbers.
 
-As described: a matrix holds the affinities of all pairs of boxes (one of each agent), on the diagonal those of nodes, off
-it those of edges, each a mean of exponentials of two differences. Its leading eigenvector, scaled to [0, 1], is the
+As described: a matrix holds the affinities of all pairs of boxes (one of each agent), on the diagonal those of nodes,
+off it those of edges, each a mean of exponentials of two differences. Its leading eigenvector, scaled to [0, 1], is the
 confidence of each pair; the assignment of largest sum is found, and pairs below a threshold are dropped.
 
 Filled in or left out:
 
-- The affinity of nodes also has a term of their positions in the world. It needs a rough pose, which an object list alone
-  does not give, and is left out: the affinity of a node is that of its length and width.
+- The affinity of nodes also has a term of their positions in the world. It needs a rough pose, which an object list
+  alone does not give, and is left out: the affinity of a node is that of its length and width.
 - Pairs that share a box have no edge (affinity 0), as is usual in spectral matching.
-- The smallest number of matches. Confidences are relative to the largest, so that the threshold alone refuses nothing. The paper's tracking of objects and its compensation of delays are left out.
+- The smallest number of matches. Confidences are relative to the largest, so that the threshold alone refuses nothing.
+  The paper's tracking of objects and its compensation of delays are left out.
 
 Settings: `PYTHONPATH=benchmarks python -m peers.search VIPS` (see `peers/search.py`).
 """
@@ -53,6 +54,11 @@ class VIPS(SingleFrameMatcher):
     heading_share: float = 0.5
     threshold: float = 0.5
     min_matches: int = 2
+
+    @classmethod
+    def published(cls) -> VIPS:
+        """The settings of the implementation described, and the least number of matches that gives a pose."""
+        return cls(0.5, 0.5, 0.1, 0.5, threshold=0.5, min_matches=2)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
         """The pose of the confident matches."""

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from peers import CBM, PEERS, VIPS, Clipper, FreeAlign, SingleFrameMatcher, V2XReg
-from peers.clipper import densest_clique
 
 from cobevglue import SE2, Boxes
+from peers import CBM, PEERS, VIPS, Clipper, FreeAlign, SingleFrameMatcher, V2XReg
+from peers.clipper import densest_clique
 
 EGO_SE2_OTHER = SE2(12.0, -7.0, 2.1)
 FIVE = ((23.0, -23.0, 0.1), (22.0, 31.0, 1.5), (-4.0, 32.0, -0.4), (-13.0, 12.0, 2.9), (-34.0, -30.0, -1.8))
@@ -21,11 +21,11 @@ ELSEWHERE = ((0.0, 0.0, 0.8), (3.2, 6.0, 0.1), (-7.4, 1.0, 2.2), (5.5, -5.1, -1.
 every_peer = pytest.mark.parametrize("peer", PEERS.values(), ids=PEERS)
 
 
-def cars(rows: tuple[tuple[float, float, float], ...], **fields: object) -> Boxes:
+def cars(rows: tuple[tuple[float, float, float], ...], **fields: list[str]) -> Boxes:
     """Cars of slightly different sizes at x, y, heading."""
     x, y, yaw = np.array(rows).T
     size = [(4.2 + 0.15 * k, 1.8 + 0.03 * k, 1.5) for k in range(len(rows))]
-    return Boxes(np.column_stack([x, y, np.zeros(len(x))]), size, yaw, **fields)  # type: ignore[arg-type]
+    return Boxes(np.column_stack([x, y, np.zeros(len(x))]), size, yaw, **fields)
 
 
 def strict(peer: type[SingleFrameMatcher]) -> SingleFrameMatcher:
@@ -45,10 +45,12 @@ def test_the_ten_distances_differ() -> None:
 
 
 @every_peer
-def test_five_moved_cars_are_recovered(peer: type[SingleFrameMatcher]) -> None:
+@pytest.mark.parametrize("published", [False, True])
+def test_five_moved_cars_are_recovered(peer: type[SingleFrameMatcher], published: bool) -> None:
+    matcher = peer.published() if published else peer()
     ego = cars(FIVE)
     order = [3, 0, 4, 2, 1]
-    found = peer().align(ego, ego.transform(EGO_SE2_OTHER.inverse())[order])
+    found = matcher.align(ego, ego.transform(EGO_SE2_OTHER.inverse())[order])
     assert found.ego_SE2_other is not None, found.reason
     translation, yaw = found.ego_SE2_other.error_to(EGO_SE2_OTHER)
     assert translation < 1e-3
