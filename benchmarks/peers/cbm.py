@@ -19,7 +19,7 @@ Filled in or left out:
 - Of equally large matchings the one with the smallest distance wins (in the released code the last one).
 - The smallest number of matches.
 
-Settings: `PYTHONPATH=benchmarks python -m peers.search CBM` (see `peers/search.py`).
+The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search CBM` (see `peers/search.py`), 2026-11-27.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class CBM(SingleFrameMatcher):
         min_matches: fewer are refused.
     """
 
-    angle: float = math.radians(10.0)
-    position: float = 3.0
+    angle: float = math.radians(30.0)
+    position: float = 5.0
     consensus: float = 0.5
-    max_distance: float = 20.0
-    min_matches: int = 2
+    max_distance: float = 1.0
+    min_matches: int = 3
 
     @classmethod
     def published(cls) -> CBM:

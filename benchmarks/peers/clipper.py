@@ -21,7 +21,7 @@ Filled in:
   accepted.
 - The smallest number of matches.
 
-Settings: `PYTHONPATH=benchmarks python -m peers.search Clipper` (see `peers/search.py`).
+The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search Clipper` (see `peers/search.py`), 2026-11-27.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Clipper(SingleFrameMatcher):
         min_matches: fewer are refused.
     """
 
-    sigma: float = 0.4
-    epsilon: float = 1.0
-    min_distance: float = 0.0
-    heading: float = math.pi / 2
-    min_matches: int = 2
+    sigma: float = 0.8
+    epsilon: float = 1.5
+    min_distance: float = 2.0
+    heading: float = math.radians(20.0)
+    min_matches: int = 3
 
     @classmethod
     def published(cls) -> Clipper:
@@ -110,7 +110,7 @@ def densest_clique(affinity: FloatArray) -> FloatArray:
         affinity: (n, n) M, symmetric, ones on the diagonal, 0 where two nodes are inconsistent.
     """
     inconsistent = (affinity == 0.0).astype(np.float64)
-    u = affinity.sum(axis=1)
+    u: FloatArray = affinity.sum(axis=1)
     u /= np.linalg.norm(u)
     penalty = 0.0
     for _ in range(_PENALTIES):

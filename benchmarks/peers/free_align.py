@@ -19,7 +19,8 @@ Filled in or left out:
   before the refusal, so that a mirrored set is refused.
 - The search over the collaborator's past lists (time delay) is left out, as is the learned initial similarity of nodes.
 
-Settings: `PYTHONPATH=benchmarks python -m peers.search FreeAlign` (see `peers/search.py`).
+The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search FreeAlign` (see `peers/search.py`),
+2026-11-27.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ class FreeAlign(SingleFrameMatcher):
     """
 
     anchor_tolerance: float = 0.6
-    box_tolerance: float = 0.5
-    min_anchors: int = 3
-    inlier_distance: float = 2.0
+    box_tolerance: float = 1.5
+    min_anchors: int = 2
+    inlier_distance: float = 1.0
 
     @classmethod
     def published(cls) -> FreeAlign:

@@ -19,7 +19,7 @@ Filled in or left out:
   are compared in both orders.
 - One threshold for all classes, since the lists of the benchmark have only one.
 
-Settings: `PYTHONPATH=benchmarks python -m peers.search V2XReg` (see `peers/search.py`).
+The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search V2XReg` (see `peers/search.py`), 2026-11-27.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class V2XReg(SingleFrameMatcher):
         half_turns: headings may be off by half a turn.
     """
 
-    max_boxes: int = 25
+    max_boxes: int = 40
     distance: float = 1.0
-    min_affinity: float = 4.0
-    few: float = 5.0
+    min_affinity: float = 1.0
+    few: float = 10.0
     half_turns: bool = False
 
     @classmethod

@@ -16,7 +16,7 @@ Filled in or left out:
 - The smallest number of matches. Confidences are relative to the largest, so that the threshold alone refuses nothing.
   The paper's tracking of objects and its compensation of delays are left out.
 
-Settings: `PYTHONPATH=benchmarks python -m peers.search VIPS` (see `peers/search.py`).
+The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search VIPS` (see `peers/search.py`), 2026-11-27.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class VIPS(SingleFrameMatcher):
 
     size_rate: float = 0.5
     distance_rate: float = 0.5
-    heading_rate: float = 0.1
-    heading_share: float = 0.5
-    threshold: float = 0.5
-    min_matches: int = 2
+    heading_rate: float = 3.0
+    heading_share: float = 0.0
+    threshold: float = 0.9
+    min_matches: int = 3
 
     @classmethod
     def published(cls) -> VIPS:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from cobevglue import SE2, Boxes
+from cobevglue.evaluation.alignment import AlignmentSequence, PairFrame
 from peers import CBM, PEERS, VIPS, Clipper, FreeAlign, SingleFrameMatcher, V2XReg
 from peers.clipper import densest_clique
+from peers.search import SPACES, criterion, search
 
 EGO_SE2_OTHER = SE2(12.0, -7.0, 2.1)
 FIVE = ((23.0, -23.0, 0.1), (22.0, 31.0, 1.5), (-4.0, 32.0, -0.4), (-13.0, 12.0, 2.9), (-34.0, -30.0, -1.8))
@@ -118,9 +120,9 @@ def test_a_mirrored_scene_is_refused(peer: type[SingleFrameMatcher]) -> None:
 def test_clipper_takes_a_mirrored_scene_without_headings() -> None:
     """Distances alone do not tell left from right: the limit of the angle between headings does."""
     mirrored = cars(tuple((x, -y, -yaw) for x, y, yaw in FIVE))
-    settings = {"sigma": 0.3, "epsilon": 0.8, "min_matches": 4}
-    assert Clipper(**settings).align(cars(FIVE), mirrored).accepted  # type: ignore[arg-type]
-    assert not Clipper(**settings, heading=0.1).align(cars(FIVE), mirrored).accepted  # type: ignore[arg-type]
+    for heading, accepted in ((math.pi / 2, True), (0.1, False)):
+        clipper = Clipper(sigma=0.3, epsilon=0.8, heading=heading, min_matches=4)
+        assert clipper.align(cars(FIVE), mirrored).accepted is accepted
 
 
 def test_densest_clique_prefers_the_heavier() -> None:
@@ -141,3 +143,24 @@ def test_densest_clique_is_a_clique(seed: int) -> None:
     affinity = upper + upper.T + np.eye(15)
     support = np.flatnonzero(densest_clique(affinity) > 1e-3)
     assert (affinity[np.ix_(support, support)] > 0.0).all()
+
+
+@every_peer
+def test_every_setting_is_searched(peer: type[SingleFrameMatcher]) -> None:
+    settings = {name for name in vars(peer()) if not name.startswith("_")}
+    assert settings == set(SPACES[peer.__name__])
+
+
+def test_search_is_reproducible_and_scores_frames() -> None:
+    """One frame that the published settings get right, and one of two unrelated lists, which they refuse."""
+    ego = cars(FIVE)
+    frames = [
+        AlignmentSequence("moved", [PairFrame(ego, ego.transform(EGO_SE2_OTHER.inverse()), EGO_SE2_OTHER, 5)]),
+        AlignmentSequence("unrelated", [PairFrame(ego, cars(ELSEWHERE), EGO_SE2_OTHER, 0)]),
+    ]
+    first, again = (search(FreeAlign, SPACES["FreeAlign"], frames, draws=3) for _ in range(2))
+    assert [settings for settings, _ in first] == [settings for settings, _ in again]
+    assert len(first) == 4
+    published = first[0][1]
+    assert (published.right, published.refused) == (0.5, 0.5)
+    assert criterion(published) == pytest.approx(0.5)
