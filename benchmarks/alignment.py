@@ -9,6 +9,7 @@
     python benchmarks/alignment.py --only scenes        # simulated scenes, lists of the other up to 0.3 s old
     python benchmarks/alignment.py --only scenes --scene-seeds confirmation   # the same, seeds kept apart
     python benchmarks/alignment.py --only unrelated     # two agents that have nothing in common
+    python benchmarks/alignment.py --only peers         # matchers of other papers on the same lists
     python benchmarks/alignment.py --only ablation      # each option of the default off, and the paper's own method
     python benchmarks/alignment.py --json results.json
 
@@ -27,6 +28,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,7 @@ from cobevglue.evaluation.alignment_data import (
 from cobevglue.evaluation.scene_data import scene_sequences
 from cobevglue.simulation.object_scenes import SCENES
 from common import DATA, print_head
+from peers import PEERS
 
 SEEDS = (0, 1, 2)
 SCENE_SEEDS = {"development": range(10), "confirmation": range(100, 110)}
@@ -235,6 +238,50 @@ def ablation(data: Path) -> Table:
     return table
 
 
+def peers(data: Path) -> Table:
+    """Matchers of other papers (`benchmarks/peers`), the paper's own and BEVGlue on the same lists."""
+    print("## Peers: V2V4Real val and train 0006 to 0010 (right: boxes land within 3 m); OPV2V labels with detection")
+    print("errors within 50 m (right: within 3 m, 3°). alone: every frame is a sequence of its own\n")
+    methods: dict[str, tuple[bool, Callable[[], Aligner]]] = {name: (True, peer) for name, peer in PEERS.items()}
+    methods |= {f"{name}, published settings": (True, peer.published) for name, peer in PEERS.items()}
+    for name, config in (("the paper's star", BEVGlueConfig.paper()), ("BEVGlue", BEVGlueConfig())):
+        methods |= {f"{name}, alone": (True, partial(BEVGlue, config)), name: (False, partial(BEVGlue, config))}
+    real = real_cars(data, V2V4REAL_VAL + V2V4REAL_TRAIN[6:], SEEDS[:1])
+    labels = noisy_labels(data, 50.0)
+    table: Table = []
+    for name, (alone, make_aligner) in methods.items():
+        on_real, on_labels = (run(each_alone(s) if alone else s, make_aligner) for s in (real, labels))
+        val = [r for r in on_real if r.sequence.startswith("val")]
+        parts: tuple[tuple[str, list[Record], Callable[[Record], bool]], ...] = (
+            ("V2V4Real", on_real, lambda r: not r.right),
+            ("V2V4Real, val only", val, lambda r: not r.right),
+            ("OPV2V, 50 m", on_labels, off_by_3),
+        )
+        for what, records, wrong in parts:
+            two, four = ([r for r in records if r.co_visible >= k] for k in (2, 4))
+            summary = summarise(records, wrong)
+            table.append(
+                {
+                    "method": name,
+                    "data": what,
+                    "frames": len(records),
+                    "right >= 2": float(np.mean([not wrong(r) for r in two])),
+                    "right >= 4": float(np.mean([not wrong(r) for r in four])),
+                    "wrong of accepted": summary.wrong_of_accepted,
+                    "refused": summary.refused,
+                    "ms": summary.median_milliseconds,
+                }
+            )
+        print(f"   … {name}", file=sys.stderr)
+    show(table)
+    return table
+
+
+def each_alone(sequences: Iterable[AlignmentSequence]) -> list[AlignmentSequence]:
+    """Every frame as a sequence of its own, so that nothing is remembered."""
+    return [AlignmentSequence(s.name, [frame]) for s in sequences for frame in s.frames]
+
+
 def real_cars(
     data: Path, names: tuple[str, ...], seeds: tuple[int, ...] = SEEDS, moving: bool = True
 ) -> list[AlignmentSequence]:
@@ -277,6 +324,7 @@ TABLES: dict[str, Callable[[Path], Table] | None] = {
     "offset": offset,
     "scenes": None,  # takes seeds instead of data
     "unrelated": unrelated,
+    "peers": peers,
     "ablation": ablation,
 }
 
