@@ -13,10 +13,10 @@
     python benchmarks/alignment.py --only ablation      # each option of the default off, and the paper's own method
     python benchmarks/alignment.py --json results.json
 
-The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`;
-`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. Of the simulated scenes, seeds 0 to 9
-are for development and 100 to 109 for confirmation: nothing is to be tuned on the latter. What "right", "wrong" and "success"
-mean: `cobevglue.evaluation.alignment`.
+The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`,
+OPV2V labels and the first seeds of the simulated scenes; V2V4Real `val` confirms them, with the reservations of
+`cobevglue.alignment.config`. Of the simulated scenes, seeds 0 to 9 are for development and 100 to 109 for confirmation.
+What "right", "wrong" and "success" mean: `cobevglue.evaluation.alignment`.
 """
 
 from __future__ import annotations

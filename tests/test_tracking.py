@@ -150,6 +150,20 @@ def test_a_frame_that_is_known_to_stand_still() -> None:
     np.testing.assert_allclose(tracker.tracks.velocity, [[10.0, 0.0]], atol=0.5)
 
 
+@pytest.mark.parametrize("step", [4.0, -5.5, 6.5])
+def test_oncoming_traffic_keeps_its_identity(step: float) -> None:
+    """Beside a convoy that stands still in the frame, two cars come the other way by up to 6.5 m a frame."""
+    convoy = [(20.0 * i, 4.0) for i in range(4)]
+    frames = [cars([*convoy, (60.0 + step * k, 0.0), (25.0 + step * k, -3.5)]) for k in range(8)]
+    assert ids_of(frames) == [list(range(6))] * 8
+
+
+def test_new_object_aside_is_not_continued() -> None:
+    """Another car appears 5 m away, but two lanes aside: it gets an identity of its own."""
+    frames = [cars([(0, 0), (30, 0), (60, 0), (90, 0), (40, 20)]), cars([(0, 0), (30, 0), (60, 0), (90, 0), (45, 27)])]
+    assert ids_of(frames)[1] == [0, 1, 2, 3, 5]
+
+
 @pytest.mark.parametrize("flipped", [{3}, {3, 6}, {4, 5}, set(range(1, 12, 3))])
 def test_flipped_heading_does_not_break_track(flipped: set[int]) -> None:
     tracker = Sort()

@@ -9,6 +9,8 @@ import pytest
 
 from cobevglue import SE2, Alignment, BEVGlue, BEVGlueConfig, Boxes
 from cobevglue.alignment import track_motion
+from cobevglue.alignment.box_rows import box_rows, track_ids
+from cobevglue.alignment.frame_motion import FrameMotion
 from cobevglue.alignment.track_motion import TRACK, TrackNoise
 from cobevglue.typing import FloatArray
 
@@ -158,3 +160,24 @@ def test_rows_in_another_order_change_nothing() -> None:
     shuffled_twist, shuffled = follow([*lists[:-1], lists[-1][order]])
     np.testing.assert_allclose(shuffled_twist, twist, rtol=1e-9)
     np.testing.assert_allclose(shuffled, velocity[order], rtol=1e-9, atol=1e-9)
+
+
+def test_frame_motion_is_found_again_after_a_turn() -> None:
+    """An agent drives straight, turns at 0.5 rad/s and drives straight on, among parked and driving vehicles."""
+    motion, pose = FrameMotion(), SE2(-30.0, 0.0, 0.0)
+    for k in range(60):
+        turn_rate = 0.5 if 20 <= k < 35 else 0.0
+        pose = pose @ SE2(0.7, 0.0, 0.1 * turn_rate)
+        boxes = observed(0.1 * k, pose, 3)
+        velocity = motion.velocities(box_rows(boxes), track_ids(boxes), 0.1)
+    np.testing.assert_allclose(motion.twist, [-7.0, 0.0, 0.0], atol=0.5)
+    parked = velocity[SPEEDS == 0.0]
+    np.testing.assert_allclose(parked, np.tile([-7.0, 0.0], (len(parked), 1)), atol=0.7)
+
+
+def test_repeated_list_keeps_its_velocities() -> None:
+    motion = FrameMotion()
+    for k in range(10):
+        boxes = observed(0.1 * k, SE2(), 3)
+        velocity = motion.velocities(box_rows(boxes), track_ids(boxes), 0.1)
+    np.testing.assert_array_equal(motion.velocities(box_rows(boxes), track_ids(boxes), 0.0), velocity)

@@ -48,7 +48,7 @@ _SAME_TURN_RATE = 9.0
 """Squared difference of two estimates of a turn rate, in variances, above which one of them is wrong."""
 _IMPOSSIBLE = 1e6
 """Evidence against a pair that cannot be one object [nats]."""
-_UNSEEN_ACCELERATION, _UNSEEN_TURN_ACCELERATION = 3.0, 0.7
+_UNSEEN_ACCELERATION, _UNSEEN_TURN_ACCELERATION = 3.0, 0.35
 """Of the other vehicle, between its list and ego's instant, beyond its motion at the list's [m/s^2, rad/s^2]."""
 _CLAIM_EVIDENCE = 2.0
 """Evidence of a claimed pose at most [nats]."""

@@ -13,9 +13,11 @@ cobevglue[simulation]`), which supports one simulation per process; hence one op
 from __future__ import annotations
 
 import math
+import sys
 import tempfile
 import weakref
 from collections import Counter
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -369,7 +371,8 @@ def _open_libsumo(owner: Traffic) -> Any:
     """Import libsumo and register `owner` as the open simulation."""
     global _open
     try:
-        import libsumo
+        with redirect_stdout(sys.stderr):  # it warns of other versions of pyarrow on standard output
+            import libsumo
     except ModuleNotFoundError:
         raise ModuleNotFoundError("traffic needs SUMO: pip install cobevglue[simulation]") from None
     if libsumo.isLoaded():
