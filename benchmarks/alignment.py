@@ -13,9 +13,9 @@
     python benchmarks/alignment.py --json results.json
 
 The data is read from $COBEVGLUE_DATA (default ../shared/data). The defaults of BEVGlue were tuned on V2V4Real `train`;
-`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. Of the simulated scenes, seeds 0 to 9
-are for development and 100 to 109 for confirmation: nothing is to be tuned on the latter. What "right", "wrong" and "success"
-mean: `cobevglue.evaluation.alignment`.
+`val` and OPV2V confirm them, with the reservations of `cobevglue.alignment.config`. Of the simulated scenes,
+seeds 0 to 9 are for development and 100 to 109 for confirmation: nothing is to be tuned on the latter. What "right",
+"wrong" and "success" mean: `cobevglue.evaluation.alignment`.
 """
 
 from __future__ import annotations

@@ -69,14 +69,16 @@ class Path:
     def smoothed(self, transition: float) -> Path:
         """This path with the curvature changing over `transition` [m] instead of at once: a clothoid, in short arcs.
 
-        The headings before and after a transition stay as they are; what follows shifts by some centimetres. Segments
-        that are no longer than a transition are not shortened.
+        The headings before and after a transition stay as they are; what follows shifts by some centimetres.
+
+        Raises:
+            ValueError: a segment is too short for its transitions.
         """
         half = transition / 2.0
         last = len(self.segments) - 1
         eased: list[tuple[float, float]] = []
         for i, (length, curvature) in enumerate(self.segments):
-            before, after = (half if 0 < i else 0.0), (half if i < last else 0.0)
+            before, after = (half if i > 0 else 0.0), (half if i < last else 0.0)
             if length <= before + after and i < last:
                 raise ValueError(f"segment {i} is {length:.2f} m long, too short for transitions of {transition} m")
             eased.append((length - before - after, curvature))
