@@ -47,4 +47,4 @@ def test_absence_raises_the_risk() -> None:
 
     assert risk(world[:4], 0.7) < 0.05
     assert risk(world, 0.0) < 0.05
-    assert risk(world, 1.5) > 0.05
+    assert risk(world, 3.0) > 0.05

@@ -1,105 +1,142 @@
-"""Scripted traffic: paths are smooth, on the right side of the road, and nobody touches anybody."""
+"""Paths, motions and placement of scripted vehicles."""
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import cumulative_trapezoid, quad
 from shapely.geometry import Polygon
 
-from cobevglue.se2 import wrap_angle
-from cobevglue.simulation.scripted_traffic import LIDAR_HEIGHT, Vehicle, place_traffic
+from cobevglue.simulation.scripted_traffic import (
+    LIDAR_HEIGHT,
+    Cruise,
+    Departure,
+    Motion,
+    Path,
+    Placement,
+    Traffic,
+    Vehicle,
+    random_kind,
+    stationary,
+)
 
-WEST, SOUTH, EAST, NORTH = range(4)
-INNER, OUTER = 1.75, 5.25
-
-
-def vehicle(
-    arm: int, lateral: float, turn: int, start: float = 0.0, speed: float = 10.0, swing: float = 0.0
-) -> Vehicle:
-    return Vehicle("car", (4.5, 1.9, 1.5), arm, lateral, turn, start, speed, swing=swing)
+EAST = Path((0.0, 0.0, 0.0), ((10.0, 0.0),))
 
 
 @pytest.mark.parametrize(
-    ("path", "start", "end", "why"),
+    ("path", "travelled", "expected", "why"),
     [
-        (vehicle(WEST, INNER, 0), (-110, -1.75, 0), (90, -1.75, 0), "from the west straight on: east, on the right"),
-        (vehicle(EAST, OUTER, 0), (110, 5.25, 180), (-90, 5.25, 180), "from the east: west, on its own right"),
-        (vehicle(SOUTH, INNER, 0), (1.75, -110, 90), (1.75, 90, 90), "from the south: north"),
-        (vehicle(NORTH, INNER, 0), (-1.75, 110, -90), (-1.75, -90, -90), "from the north: south"),
-        (vehicle(WEST, INNER, 1), (-110, -1.75, 0), (1.75, None, 90), "a left turn from the west leaves to the north"),
-        (vehicle(WEST, OUTER, -1), (-110, -5.25, 0), (-5.25, None, -90), "a right turn from the west, to the south"),
-        (vehicle(SOUTH, OUTER, -1), (5.25, -110, 90), (None, -5.25, 0), "a right turn from the south, to the east"),
-        (vehicle(EAST, INNER, 1), (110, 1.75, 180), (-1.75, None, -90), "a left turn from the east, to the south"),
+        (EAST, 7.0, (7, 0, 0), "straight on"),
+        (EAST, -7.0, (-7, 0, 0), "the first segment extends backwards"),
+        (EAST, 70.0, (70, 0, 0), "the last segment extends forwards"),
+        (Path((1, 2, math.pi / 2), ((5, 0.0),)), 5.0, (1, 7, 90), "a start to the north"),
+        (Path((0, 0, 0), ((20, 0.1),)), 5 * math.pi, (10, 10, 90), "a quarter circle of 10 m to the left"),
+        (Path((0, 0, 0), ((20, -0.1),)), 5 * math.pi, (10, -10, -90), "and to the right"),
+        (Path((0, 0, 0), ((4, 0), (5 * math.pi, 0.1), (9, 0))), 4 + 5 * math.pi + 3, (14, 13, 90), "line, arc, line"),
     ],
 )
-def test_where_paths_begin_and_end(
-    path: Vehicle, start: tuple[float, ...], end: tuple[float | None, ...], why: str
-) -> None:
-    poses = path.pose(np.array([0.0, 20.0]))
-    for pose, expected in zip(poses, (start, end), strict=True):
-        for value, wanted in zip(pose[:2], expected[:2], strict=True):
-            assert wanted is None or value == pytest.approx(wanted, abs=1e-9), why
-        assert expected[2] is not None
-        assert wrap_angle(pose[2] - math.radians(expected[2])) == pytest.approx(0.0, abs=1e-9), why
+def test_pose_along_a_path(path: Path, travelled: float, expected: tuple[float, ...], why: str) -> None:
+    x, y, yaw = path.at(np.array([travelled]))[0]
+    np.testing.assert_allclose((x, y, math.degrees(yaw)), expected, atol=1e-9, err_msg=why)
 
 
-@pytest.mark.parametrize("turn", [-1, 0, 1])
-@pytest.mark.parametrize("swing", [0.0, 0.3])
-def test_vehicles_move_ahead_and_turn_smoothly(turn: int, swing: float) -> None:
-    time = np.arange(0.0, 20.0, 0.01)
-    pose = vehicle(SOUTH, OUTER if turn < 0 else INNER, turn, swing=swing).pose(time)
-    step = np.diff(pose[:, :2], axis=0)
-    speed = np.hypot(*step.T) / 0.01
-    heading = np.arctan2(step[:, 1], step[:, 0])
-    assert speed.min() > 10 * (1 - swing) - 0.1
-    assert speed.max() < 10 * (1 + swing) + 0.1
-    assert np.abs(wrap_angle(heading - pose[:-1, 2])).max() < 0.02, "they drive where they look"
-    assert np.abs(np.diff(pose[:, 2])).max() < 0.02, "and their heading does not jump"
+@given(st.lists(st.tuples(st.floats(8, 30), st.floats(-0.1, 0.1)), min_size=1, max_size=5), st.floats(0.5, 6.0))
+def test_smoothed_path_is_integral_of_its_curvature(segments: list[tuple[float, float]], transition: float) -> None:
+    sharp = Path((3.0, -2.0, 0.7), tuple(segments))
+    path = sharp.smoothed(transition)
+    total = sum(length for length, _ in segments)
+    assert sum(length for length, _ in path.segments) == pytest.approx(total)
+    assert path.at(np.array([total]))[0, 2] == pytest.approx(sharp.at(np.array([total]))[0, 2]), "the turn is the same"
+    s = np.linspace(0.0, total, 4001)
+    poses = path.at(s)
+    x = 3.0 + cumulative_trapezoid(np.cos(poses[:, 2]), s, initial=0.0)
+    y = -2.0 + cumulative_trapezoid(np.sin(poses[:, 2]), s, initial=0.0)
+    np.testing.assert_allclose(poses[:, :2], np.column_stack([x, y]), atol=1e-4)
 
 
-def test_a_vehicle_without_speed_stands() -> None:
-    poses = vehicle(WEST, INNER, 0, start=50.0, speed=0.0, swing=0.3).pose(np.array([0.0, 5.0, 50.0]))
+def test_smoothed_path_turns_gradually() -> None:
+    path = Path((0.0, 0.0, 0.0), ((20.0, 0.0), (20.0, 0.1), (20.0, 0.0)))
+    s = np.arange(0.0, 60.0, 0.1)
+    most = [np.abs(np.diff(p.at(s)[:, 2], 2)).max() / 0.1**2 for p in (path, path.smoothed(8.0))]
+    assert most[0] > 0.9, "a change of curvature of 0.1 in 0.1 m"
+    assert most[1] < 0.2, "one eighth of it within 1 m"
+
+
+def test_short_segment_cannot_be_smoothed() -> None:
+    with pytest.raises(ValueError, match=r"segment 1 is 2.00 m long, too short for transitions of 3.0 m"):
+        Path((0.0, 0.0, 0.0), ((20.0, 0.0), (2.0, 0.1), (20.0, 0.0))).smoothed(3.0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "speed"),
+    [
+        (Cruise(5.0, 10.0, 0.3, 8.0, 1.0), lambda t: 10.0 * (1.0 + 0.3 * math.cos(2.0 * math.pi / 8.0 * t + 1.0))),
+        (
+            Departure(5.0, 2.0, 9.0, 4.0),
+            lambda t: 9.0 * (3 * u**2 - 2 * u**3 if (u := (t - 2) / 4) < 1 else 1) * (t > 2),
+        ),
+    ],
+)
+def test_travelled_is_integral_of_speed(motion: Motion, speed: object) -> None:
+    for time in (0.0, 1.0, 3.0, 7.0, 12.0):
+        expected, _ = quad(speed, 0.0, time, points=[2.0, 6.0], limit=200)
+        assert motion.travelled(np.array([time]))[0] == pytest.approx(5.0 + expected, abs=1e-6)
+
+
+def test_vehicle_without_speed_stays() -> None:
+    poses = Vehicle("car", (4.5, 1.9, 1.5), EAST, Cruise(50.0, 0.0, 0.3)).pose(np.array([0.0, 5.0, 50.0]))
     assert (poses == poses[0]).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_two_vehicles_ever_touch(seed: int) -> None:
-    traffic = place_traffic(32, 4, 8.0, np.random.default_rng([seed, 0, 0]))
-    for time in np.arange(0.0, 8.0, 0.5):
-        footprints = [Polygon(corners) for corners in traffic.at(float(time)).bev_corners()]
-        for (i, a), (j, b) in itertools.combinations(enumerate(footprints), 2):
-            assert not a.intersects(b), f"vehicles {i} and {j} at {time} s"
+def test_follower_repeats_leader_a_reaction_time_later() -> None:
+    reaction, rate = 1.5, 2.0 * math.pi / 9.0
+    leader, follower = Cruise(0.0, 30.0, 0.05, 9.0, 0.4), Cruise(-40.0, 30.0, 0.05, 9.0, 0.4 - rate * reaction)
+    time = np.linspace(2.0, 10.0, 50)
+    steps = [np.diff(motion.travelled(at)) for motion, at in ((leader, time - reaction), (follower, time))]
+    np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)
 
 
-@pytest.mark.parametrize("duration", [2.0, 8.0, 15.0])
-def test_eight_agents_find_room(duration: float) -> None:
-    traffic = place_traffic(8, 8, duration, np.random.default_rng([0, 0, 0]))
-    for time in np.arange(0.0, duration, 0.5):
-        footprints = [Polygon(corners) for corners in traffic.at(float(time)).bev_corners()]
-        assert not any(a.intersects(b) for a, b in itertools.combinations(footprints, 2))
+def test_traffic_has_boxes_on_the_ground() -> None:
+    parked, moving = (
+        stationary("van", (5.0, 2.0, 2.2), 3.0, 4.0, 0.5),
+        Vehicle("car", (4.5, 1.9, 1.5), EAST, Cruise(0.0, 10.0)),
+    )
+    boxes = Traffic((parked, moving)).at(2.0)
+    np.testing.assert_allclose(boxes.bev, [(3.0, 4.0, 5.0, 2.0, 0.5), (20.0, 0.0, 4.5, 1.9, 0.0)])
+    np.testing.assert_allclose(boxes.center[:, 2] - boxes.size[:, 2] / 2, -LIDAR_HEIGHT)
+    assert boxes.track_id is not None
+    assert boxes.label is not None
+    assert (boxes.track_id.tolist(), boxes.label.tolist()) == ([0, 1], ["van", "car"])
 
 
-def test_there_is_some_of_everything() -> None:
-    labels: set[str] = set()
-    for seed in range(5):
-        traffic = place_traffic(32, 2, 8.0, np.random.default_rng([seed, 0, 0]))
-        speeds = np.array([v.speed for v in traffic.vehicles])
-        assert (speeds[:2] > 0).all(), "agents drive"
-        assert 8 <= (speeds == 0).sum() <= 20, "some stand"
-        assert (speeds > 0).sum() >= 10, "some drive"
-        labels |= {v.label for v in traffic.vehicles}
-    assert labels == {"car", "van", "truck", "bus"}
+@given(st.floats(3.0, 17.0), st.floats(3.0, 17.0), st.floats(-12, 12), st.floats(-5, 5), st.floats(-3.0, 3.0))
+def test_placed_vehicles_do_not_overlap(long: float, other: float, x: float, y: float, yaw: float) -> None:
+    a, b = stationary("car", (long, 2.0, 1.5), 0.0, 0.0, 0.0), stationary("car", (other, 2.5, 1.5), x, y, yaw)
+    placement = Placement(1.0)
+    assert placement.add(a)
+    first, second = (Polygon(corners) for corners in Traffic((a, b)).at(0.0).bev_corners())
+    if placement.add(b):
+        assert not first.intersects(second)
+    else:
+        assert first.distance(second) < 2.5, "only what is near is refused"
+        assert placement.vehicles == [a]
 
 
-def test_boxes_stand_on_the_ground_below_the_lidar() -> None:
-    objects = place_traffic(20, 2, 8.0, np.random.default_rng([0, 0, 0])).at(1.0)
-    np.testing.assert_allclose(objects.center[:, 2] - objects.size[:, 2] / 2, -LIDAR_HEIGHT)
+def test_crossing_vehicles_touch_at_any_time() -> None:
+    placement = Placement(10.0)
+    north = Path((0.0, -50.0, math.pi / 2), ((1.0, 0.0),))
+    assert placement.add(Vehicle("car", (4.5, 1.9, 1.5), EAST, Cruise(-50.0, 10.0)))
+    assert not placement.add(Vehicle("car", (4.5, 1.9, 1.5), north, Cruise(0.0, 10.0))), "both at the origin at 5 s"
+    assert placement.add(Vehicle("car", (4.5, 1.9, 1.5), north, Cruise(-10.0, 10.0))), "a second later"
 
 
-def test_full_junction_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cobevglue.simulation.scripted_traffic._MAX_FAILURES", 20)
-    with pytest.raises(ValueError, match="the junction has room for"):
-        place_traffic(300, 2, 1.0, np.random.default_rng([0, 0, 0]))
+def test_random_kinds_follow_their_shares() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [random_kind(rng, {"car": 3.0, "semitrailer": 1.0}) for _ in range(400)]
+    assert sum(label == "truck" for label, _ in drawn) == pytest.approx(100, abs=30)
+    assert all(size[0] > 15.0 for label, size in drawn if label == "truck")
+    assert all(3.8 < size[0] < 5.2 and 1.6 < size[1] < 2.1 for label, size in drawn if label == "car")

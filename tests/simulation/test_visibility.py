@@ -66,3 +66,23 @@ def test_company_never_makes_a_box_more_visible(
     assert fractions.max() > 0
     fewer = visible_fraction(boxes(*rows[:-1]))
     assert (fractions[:-1] <= fewer + 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("sensor_height", "hiding_height", "seen", "why"),
+    [
+        (6.0, 1.5, [1.0, 1.0], "a mast looks over a car at the roof of the next one"),
+        (6.0, 4.0, [1.0, 0.0], "not over a truck that is right before it"),
+        (1.9, 2.5, [1.0, 0.0], "a roof of a car does not look over a van"),
+        (40.0, 4.0, [1.0, 1.0], "from high enough every roof is seen"),
+    ],
+)
+def test_sensor_looks_over_low_boxes(sensor_height: float, hiding_height: float, seen: list[float], why: str) -> None:
+    scene = boxes((14, 0, 5, 2, 0), (20, 0, 4, 1.8, 0))
+    height = np.array([hiding_height, 1.5])
+    scene = scene.replace(
+        center=np.column_stack([scene.center[:, :2], height / 2 - sensor_height]),
+        size=np.column_stack([scene.size[:, :2], height]),
+    )
+    np.testing.assert_allclose(visible_fraction(scene, over_tops=True), seen, err_msg=why)
+    np.testing.assert_allclose(visible_fraction(scene), [1.0, 0.0], err_msg="footprints alone hide it")

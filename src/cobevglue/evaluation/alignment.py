@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cobevglue.alignment.alignment import Aligner
+from cobevglue.alignment.alignment import Aligner, Alignment
 from cobevglue.alignment.own_body import known_bodies
 from cobevglue.boxes import Boxes
-from cobevglue.se2 import SE2
+from cobevglue.se2 import SE2, wrap_angle
 from cobevglue.typing import IntArray
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "by_co_visible",
     "evaluate",
     "landing_error",
+    "normalised_error",
     "off_by_3",
     "summarise",
 ]
@@ -80,7 +81,8 @@ class AlignmentSequence:
 class Record:
     """Result of an aligner in one frame. Errors are infinite if it refused; `seconds` is the duration of the call.
 
-    `time_offset_error` [s] is NaN if it refused or the true offset is unknown.
+    `time_offset_error` [s] is NaN if it refused or the true offset is unknown. `risk` is the stated one; `nees` is the
+    normalised estimation error squared of x, y and yaw (mean 3 where the covariance is right), NaN if it refused.
     """
 
     sequence: str
@@ -94,6 +96,8 @@ class Record:
     possible_matches: int
     seconds: float
     time_offset_error: float = math.nan
+    risk: float = math.nan
+    nees: float = math.nan
 
     @property
     def right(self) -> bool:
@@ -128,6 +132,16 @@ def landing_error(estimate: SE2, truth: SE2, other: Boxes) -> float:
     return float(np.hypot(gap[:, 0], gap[:, 1]).mean())
 
 
+def normalised_error(alignment: Alignment, truth: SE2) -> float:
+    """Squared error of x, y and yaw of an accepted pose, normalised by its covariance (NEES)."""
+    assert alignment.ego_SE2_other is not None
+    estimate = alignment.ego_SE2_other
+    error = np.array([estimate.x - truth.x, estimate.y - truth.y, wrap_angle(estimate.yaw - truth.yaw)])
+    if not np.isfinite(alignment.covariance).all():
+        return math.nan
+    return float(error @ np.linalg.pinv(alignment.covariance) @ error)
+
+
 def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], Aligner]) -> Iterator[Record]:
     """Run a new aligner on each sequence, in order."""
     for sequence in sequences:
@@ -138,7 +152,9 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
             alignment = aligner.align(frame.ego, frame.other, frame.time, **bodies)
             seconds = time.perf_counter() - start
             translation = yaw = landing = math.inf
+            nees = math.nan
             if alignment.ego_SE2_other is not None:
+                nees = normalised_error(alignment, frame.ego_SE2_other)
                 translation, yaw = alignment.ego_SE2_other.error_to(frame.ego_SE2_other)
                 landing = landing_error(alignment.ego_SE2_other, frame.ego_SE2_other, frame.other)
             true, possible = _count_matches(alignment.matches, frame.pairs)
@@ -154,6 +170,8 @@ def evaluate(sequences: Iterable[AlignmentSequence], make_aligner: Callable[[], 
                 possible if alignment.accepted else 0,
                 seconds,
                 abs(alignment.time_offset - frame.time_offset) if alignment.accepted else math.nan,
+                alignment.risk,
+                nees,
             )
 
 

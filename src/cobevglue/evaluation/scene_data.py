@@ -11,7 +11,7 @@ from cobevglue.simulation.object_lists import AgentView, SensorSettings, observe
 from cobevglue.simulation.object_scenes import SCENES, Scene
 from cobevglue.tracking import Sort
 
-__all__ = ["scene_sequence", "scene_sequences"]
+__all__ = ["scene_of", "scene_sequence", "scene_sequences"]
 
 _FRAME = 0.1
 _MOST_DELAY = 1.0
@@ -55,20 +55,17 @@ def scene_sequence(
 
     Returns:
         Frames with tracked boxes: `other` in the other's frame at the instant of its list. `ego_SE2_other` has both
-        frames at the ego's instant, `time_offset` is minus the delay of the list; bodies are given, except a mast's.
+        frames at the ego's instant, `time_offset` is minus the delay of the list, bodies are given except a mast's.
 
     Raises:
         ValueError: no such scene, a delay beyond 1 s or so large a jitter that lists would overtake each other.
     """
-    if name not in SCENES:
-        raise ValueError(f"no scene {name!r}; there are {', '.join(SCENES)}")
     if not 0.0 <= jitter < _FRAME / 2.0:
         raise ValueError(f"jitter must be at least 0 and below {_FRAME / 2.0} s, got {jitter}")
     if not abs(delay) + jitter <= _MOST_DELAY:
         raise ValueError(f"delay must be within {_MOST_DELAY} s, jitter included, got {delay}")
     sensor = sensor or _SENSOR
-    rng = np.random.default_rng([seed, _SCENE_STREAM, list(SCENES).index(name)])
-    scene = SCENES[name](rng, duration + 2.0 * _MOST_DELAY)
+    scene = scene_of(name, seed, duration)
     ego, other = scene.agents
     ego_tracker, other_tracker = Sort(), Sort()
     frames = []
@@ -93,6 +90,18 @@ def scene_sequence(
             )
         )
     return AlignmentSequence(f"{name}/{seed}", frames)
+
+
+def scene_of(name: str, seed: int, duration: float = 8.0) -> Scene:
+    """The traffic and the agents of `scene_sequence`; the ego's first frame is at 1 s.
+
+    Raises:
+        ValueError: no such scene.
+    """
+    if name not in SCENES:
+        raise ValueError(f"no scene {name!r}; there are {', '.join(SCENES)}")
+    rng = np.random.default_rng([seed, _SCENE_STREAM, list(SCENES).index(name)])
+    return SCENES[name](rng, duration + 2.0 * _MOST_DELAY)
 
 
 def _view(scene: Scene, agent: str, time: float, sensor: SensorSettings, key: list[int]) -> AgentView:

@@ -69,8 +69,10 @@ class Path:
     def smoothed(self, transition: float) -> Path:
         """This path with the curvature changing over `transition` [m] instead of at once: a clothoid, in short arcs.
 
-        The headings before and after a transition stay as they are; what follows shifts by some centimetres. Segments
-        that are no longer than a transition are not shortened.
+        The headings before and after a transition stay as they are; what follows shifts by some centimetres.
+
+        Raises:
+            ValueError: a segment is too short for its transitions.
         """
         half = transition / 2.0
         last = len(self.segments) - 1

@@ -22,21 +22,23 @@ from cobevglue.simulation.scripted_traffic import (
     stationary,
 )
 
-__all__ = ["car_park"]
+__all__ = ["car_park_scene"]
 
-_STALL_WIDTH, _STALL_LENGTH, _AISLE = 2.6, 5.2, 6.8  # [m]
+_STALL_WIDTH, _STALL_LENGTH, _AISLE = 2.6, 5.5, 6.8  # [m]
 _PITCH = 2.0 * _STALL_LENGTH + _AISLE  # from aisle to aisle [m]
 _AISLES, _STALLS = 4, 32  # aisles, and stalls along each of their two sides
 _KINDS = {"car": 0.92, "van": 0.08}
 _OCCUPIED = (0.5, 0.85)  # least and most share of the stalls
 _BACKED_IN = 0.3
-_SIDE_STD, _ALONG_STD, _SKEW_STD = 0.1, 0.2, math.radians(1.2)  # of the places of parked cars, cut at two of each
+_LONGEST = 5.2  # vehicle that parks in a stall [m]
+_MARGIN = 0.15  # from the aisle to a parked vehicle [m]
+_SIDE_STD, _ALONG_STD, _SKEW_STD = 0.06, 0.06, math.radians(0.8)  # of the places of parked vehicles, cut at two of each
 _LANE = 1.6  # offset of a vehicle to the right of its aisle's middle [m]
 _MOVERS = (1, 3)  # least and most number beside the agents
 _TRIES = 30
 
 
-def car_park(rng: np.random.Generator, duration: float) -> Scene:
+def car_park_scene(rng: np.random.Generator, duration: float) -> Scene:
     """Two agents in the same aisle or in neighbouring ones, 10 to 30 m apart along the rows, either way round."""
     placement = Placement(duration)
     aisle = int(rng.integers(0, _AISLES - 1))
@@ -61,7 +63,7 @@ def car_park(rng: np.random.Generator, duration: float) -> Scene:
         for side in (-1, 1):
             for stall in range(_STALLS):
                 if rng.random() < share:
-                    # Stalls are wider than the cars in them, whatever their places: no check is needed.
+                    # Stalls are larger than the vehicles in them, wherever these stand: no check is needed.
                     placement.add_unchecked(_parked(row, side, stall, rng))
     return Scene(Traffic(tuple(placement.vehicles)), {"car1": 0, "car2": 1})
 
@@ -73,10 +75,11 @@ def _aisle_y(aisle: int) -> float:
 def _parked(aisle: int, side: int, stall: int, rng: np.random.Generator) -> Vehicle:
     """A car in a stall; `side` is 1 to the north of the aisle, -1 to the south."""
     label, size = random_kind(rng, _KINDS)
+    while size[0] > _LONGEST:
+        label, size = random_kind(rng, _KINDS)
     across, along, skew = np.clip(rng.standard_normal(3), -2.0, 2.0) * (_SIDE_STD, _ALONG_STD, _SKEW_STD)
     x = (stall - (_STALLS - 1) / 2.0) * _STALL_WIDTH + float(across)
-    # The front or the rear of every car is at the same distance from the aisle, more or less.
-    y = _aisle_y(aisle) + side * (_AISLE / 2.0 + 0.5 + size[0] / 2.0 + 0.5 * float(along))
+    y = _aisle_y(aisle) + side * (_AISLE / 2.0 + _MARGIN + size[0] / 2.0 + float(along))
     nose = side if rng.random() >= _BACKED_IN else -side
     return stationary(label, size, x, y, nose * math.pi / 2.0 + float(skew))
 

@@ -32,8 +32,8 @@ __all__ = [
     "SOUTH",
     "STOP_LINE",
     "WEST",
-    "junction",
     "junction_path",
+    "junction_scene",
     "parked_beside",
     "place_traffic",
 ]
@@ -58,7 +58,7 @@ _MAX_FAILURES = 300  # consecutive failures after which the junction is full
 _VEHICLES = 32
 
 
-def junction(rng: np.random.Generator, duration: float) -> Scene:
+def junction_scene(rng: np.random.Generator, duration: float) -> Scene:
     """Two agents that approach the junction from the west and from the south, among 30 other vehicles."""
     return Scene(place_traffic(_VEHICLES, 2, duration, rng), {"car1": 0, "car2": 1})
 

@@ -34,7 +34,7 @@ from cobevglue.simulation.scripted_traffic import (
     random_kind,
 )
 
-__all__ = ["mast_over_queue"]
+__all__ = ["mast_scene"]
 
 _KINDS = {"car": 0.76, "van": 0.14, "truck": 0.06, "bus": 0.04}
 _QUEUE = (4, 8)  # least and most vehicles in each lane of the agent's arm
@@ -50,7 +50,7 @@ _MAST_HEIGHT = (6.0, 8.0)
 _MAST_ALONG = (15.0, 35.0)  # from the junction's centre [m]
 
 
-def mast_over_queue(rng: np.random.Generator, duration: float) -> Scene:
+def mast_scene(rng: np.random.Generator, duration: float) -> Scene:
     """A mast over the queue on the western arm, and an agent that waits in it; either may be the first agent."""
     green = float(rng.uniform(*_GREEN))
     placement = Placement(duration)

@@ -1,7 +1,7 @@
 """A motorway platoon: two agents in a row of vehicles, three lanes each way in a gentle bend, oncoming traffic.
 
 The order within a lane stays: each vehicle repeats the speed of the one ahead a reaction time later, and the mean
-speeds of a lane differ by a few percent at most. Some 36 vehicles are within 150 m of the platoon at any time.
+speeds within a lane differ by a few percent at most. Some 36 vehicles are within 150 m of the platoon at any time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from cobevglue.simulation.object_scenes.scene import Scene
 from cobevglue.simulation.scripted_traffic import Cruise, Path, Placement, Traffic, Vehicle, mean_size, random_kind
 
-__all__ = ["motorway"]
+__all__ = ["motorway_scene"]
 
 _LANES = {  # offset to the right of the centre line [m]: mean speed [m/s], kinds of vehicles
     5.0: (34.0, {"car": 0.92, "van": 0.08}),
@@ -30,7 +30,7 @@ _OWN_SPEED_STD = 0.015  # of a vehicle's mean speed, relative to that of its lan
 _MOST_CURVATURE = 1.0 / 800.0  # [1/m]
 
 
-def motorway(rng: np.random.Generator, duration: float) -> Scene:
+def motorway_scene(rng: np.random.Generator, duration: float) -> Scene:
     """Two agents in a platoon in the middle lane, next to each other or with one vehicle between them."""
     curvature = float(rng.uniform(-_MOST_CURVATURE, _MOST_CURVATURE))
     speed = _LANES[_PLATOON_LANE][0] * float(rng.uniform(0.92, 1.05))

@@ -12,7 +12,7 @@ import numpy as np
 from cobevglue.simulation.object_scenes.scene import Scene
 from cobevglue.simulation.scripted_traffic import Cruise, Path, Placement, Traffic, Vehicle, mean_size, random_kind
 
-__all__ = ["roundabout", "roundabout_path"]
+__all__ = ["roundabout_path", "roundabout_scene"]
 
 _CIRCLE, _ENTRY, _LANE = 18.0, 14.0, 2.2  # radii of circle and entry, offset of a lane from its arm's middle [m]
 _ALONG = math.sqrt((_CIRCLE + _ENTRY) ** 2 - (_LANE + _ENTRY) ** 2)  # from the origin to the start of an entry [m]
@@ -28,10 +28,10 @@ _PARKED_KINDS = {"car": 0.85, "van": 0.15}
 _PARKED, _DRIVING = (6, 11), (14, 20)  # least and most number of vehicles
 _MOST_WAITING = 3  # vehicles at an entry
 _TRIES = 60  # for each driving vehicle
-_AGENT_START = (20.0, 55.0)  # from the entry at time 0, least and most [m]
+_AGENT_START = (12.0, 42.0)  # from the entry at time 0, least and most [m]
 
 
-def roundabout(rng: np.random.Generator, duration: float) -> Scene:
+def roundabout_scene(rng: np.random.Generator, duration: float) -> Scene:
     """Two agents that come from different arms and drive through the roundabout."""
     placement = Placement(duration)
     arms = rng.permutation(4)
