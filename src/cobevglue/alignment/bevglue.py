@@ -11,6 +11,7 @@ import numpy as np
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.common_subgraph import common_subgraph, surviving_pairs
 from cobevglue.alignment.config import BEVGlueConfig
+from cobevglue.alignment.hypotheses import PoseHypothesis, from_records
 from cobevglue.alignment.object_graph import ObjectGraph
 from cobevglue.alignment.own_body import append_body, check_bodies
 from cobevglue.alignment.procrustes import procrustes
@@ -98,6 +99,11 @@ class BEVGlue:
         )
         return check_bodies(alignment, ego, other, ego_body, other_body)
 
+    @property
+    def hypotheses(self) -> tuple[PoseHypothesis, ...]:
+        """The poses that fit the lists of the last call, accepted or not, best first; () for the paper's method."""
+        return self._matcher.hypotheses
+
     def reset(self) -> None:
         """Forget all frames."""
         self._clock.reset()
@@ -127,6 +133,8 @@ class BEVGlue:
 
 class _PaperMatcher:
     """The method as printed: graphs, temporally consistent maximum common subgraph, SVD."""
+
+    hypotheses: tuple[PoseHypothesis, ...] = ()
 
     def __init__(self, config: BEVGlueConfig) -> None:
         self._config = config
@@ -191,8 +199,13 @@ class _EvidenceMatcher:
     def reset(self) -> None:
         self._hypotheses = np.zeros(0, self._kernels.HYPOTHESIS)
         self._seen = 0
+        self._choices = 0
         self._stamps = 0.0
         self._motion_of_other = _OtherMotion(self._config)
+
+    @property
+    def hypotheses(self) -> tuple[PoseHypothesis, ...]:
+        return from_records(self._hypotheses, self._seen, self._choices, self._config)
 
     def align(
         self, ego: Boxes, other: Boxes, dt: float, other_dt: float, stamps: float, last_differ: bool, other_body: bool
@@ -219,12 +232,12 @@ class _EvidenceMatcher:
             self._rounds,
         )
         self._seen += 1
+        self._choices = len(ego) * len(other)
         self._stamps = stamps
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0)
         evidence = float(self._hypotheses[0]["evidence"])
-        choices = len(ego) * len(other)
-        reason = self._doubt(len(pairs), choices, evidence, margin, landing_std) if self._config.verdict else ""
+        reason = self._doubt(len(pairs), self._choices, evidence, margin, landing_std) if self._config.verdict else ""
         if reason:
             return Alignment.refused(reason, evidence, margin)
         ego_SE2_list = SE2(x, y, yaw)
