@@ -7,9 +7,11 @@ from typing import Any
 
 from cobevglue.alignment.alignment import Aligner, Alignment
 from cobevglue.alignment.bevglue import BEVGlue
+from cobevglue.alignment.bevglue_group import BEVGlueGroup
 from cobevglue.alignment.config import AffinityConfig, BEVGlueConfig
 from cobevglue.alignment.given import GivenLocalisation
 from cobevglue.alignment.group import GroupAligner, Observation, Pairwise
+from cobevglue.alignment.hypotheses import PoseHypothesis
 from cobevglue.alignment.max_consensus import MaximumConsensus
 from cobevglue.alignment.pose_graph import CoAlign
 from cobevglue.alignment.registration import ICP2D, ICP3D, FPFHTeaser
@@ -23,13 +25,16 @@ __all__ = [
     "Alignment",
     "BEVGlue",
     "BEVGlueConfig",
+    "BEVGlueGroup",
     "GroupAligner",
     "Observation",
+    "PoseHypothesis",
     "group_aligner",
 ]
 
 ALIGNERS: dict[str, type[Aligner] | type[GroupAligner]] = {
     "bevglue": BEVGlue,
+    "bevglue-group": BEVGlueGroup,
     "given": GivenLocalisation,
     "coalign": CoAlign,
     "fpv-rcnn": MaximumConsensus,

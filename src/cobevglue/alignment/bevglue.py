@@ -9,6 +9,7 @@ import numpy as np
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.config import BEVGlueConfig
 from cobevglue.alignment.evidence_matcher import EvidenceMatcher, ListTimes
+from cobevglue.alignment.hypotheses import PoseHypothesis
 from cobevglue.alignment.own_body import append_body, check_bodies
 from cobevglue.alignment.paper_matcher import PaperMatcher
 from cobevglue.boxes import Boxes
@@ -95,6 +96,11 @@ class BEVGlue:
         else:
             alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
         return check_bodies(alignment, ego, other, ego_body, other_body)
+
+    @property
+    def hypotheses(self) -> tuple[PoseHypothesis, ...]:
+        """The poses that fit the lists of the last call, accepted or not, best first; () for the paper's method."""
+        return self._matcher.hypotheses
 
     def reset(self) -> None:
         """Forget all frames."""

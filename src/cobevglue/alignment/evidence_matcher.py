@@ -12,6 +12,7 @@ from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.box_rows import box_rows, track_ids
 from cobevglue.alignment.config import BEVGlueConfig
 from cobevglue.alignment.frame_motion import FrameMotion
+from cobevglue.alignment.hypotheses import PoseHypothesis, from_records
 from cobevglue.alignment.verdict import judge
 from cobevglue.boxes import Boxes
 from cobevglue.se2 import SE2
@@ -77,6 +78,11 @@ class EvidenceMatcher:
         self._seen = 0
         self._expected_offset = 0.0
         self._ego_motion, self._other_motion = FrameMotion(), FrameMotion()
+
+    @property
+    def hypotheses(self) -> tuple[PoseHypothesis, ...]:
+        """The poses that fit the lists of the last call, best first."""
+        return from_records(self._hypotheses, self._seen, self._config)
 
     def align(
         self,

@@ -7,6 +7,7 @@ import numpy as np
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.common_subgraph import common_subgraph, surviving_pairs
 from cobevglue.alignment.config import BEVGlueConfig
+from cobevglue.alignment.hypotheses import PoseHypothesis
 from cobevglue.alignment.object_graph import ObjectGraph
 from cobevglue.alignment.procrustes import procrustes
 from cobevglue.boxes import Boxes
@@ -17,6 +18,8 @@ __all__ = ["PaperMatcher"]
 
 class PaperMatcher:
     """The method as printed: graphs, temporally consistent maximum common subgraph, SVD."""
+
+    hypotheses: tuple[PoseHypothesis, ...] = ()
 
     def __init__(self, config: BEVGlueConfig) -> None:
         self._config = config
