@@ -99,7 +99,7 @@ def test_jitter_changes_the_age_of_each_list() -> None:
     assert offsets.std() > 0.01
 
 
-def test_same_seed_gives_same_sequence_and_other_seeds_others() -> None:
+def test_seed_determines_sequence() -> None:
     first, again = (scene_sequence("motorway", 3, 0.1, duration=0.5) for _ in range(2))
     different, *_ = scene_sequences("motorway", [4], 0.1, duration=0.5)
     assert [content(f) for f in first.frames] == [content(f) for f in again.frames]

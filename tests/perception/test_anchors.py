@@ -88,6 +88,7 @@ def test_assignment_is_what_all_pairs_give(boxes: list[tuple[float, ...]]) -> No
     assert not set(targets.positive) & set(targets.ignored)
     assert not (best[targets.ignored] < SMALL.negative_iou - 1e-9).any()
     distance = np.abs(owned[:, None, :6] - array[None, :, :6]).max(axis=2)
+    distance = np.maximum(distance, np.abs(np.sin(owned[:, None, 6] - array[None, :, 6])))
     assert (distance.min(axis=1) < 1e-4).all(), "every positive is one of the objects"
     own = iou[distance.argmin(axis=1), targets.positive]
     by_rule = best[targets.positive] >= SMALL.positive_iou

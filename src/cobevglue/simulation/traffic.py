@@ -12,8 +12,8 @@ cobevglue[simulation]`), which supports one simulation per process; hence one op
 
 from __future__ import annotations
 
+import io
 import math
-import sys
 import tempfile
 import weakref
 from collections import Counter
@@ -371,7 +371,7 @@ def _open_libsumo(owner: Traffic) -> Any:
     """Import libsumo and register `owner` as the open simulation."""
     global _open
     try:
-        with redirect_stdout(sys.stderr):  # it warns of other versions of pyarrow on standard output
+        with redirect_stdout(io.StringIO()):  # it warns of versions of pyarrow, which is not used here
             import libsumo
     except ModuleNotFoundError:
         raise ModuleNotFoundError("traffic needs SUMO: pip install cobevglue[simulation]") from None
