@@ -57,7 +57,6 @@ RISK_BINS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 1.0)
 SCENE_SEEDS = {"development": range(10), "confirmation": range(100, 110)}
 OFF = (
     "time_offset",
-    "range_tolerance",
     "one_to_one",
     "heading_flips",
     "sizes",
@@ -253,6 +252,7 @@ def ablation(data: Path) -> Table:
     print("## Ablation\n")
     variants = {"robust default": BEVGlueConfig()}
     variants |= {f"without {option}": BEVGlueConfig().model_copy(update={option: False}) for option in OFF}
+    variants["with range_tolerance"] = BEVGlueConfig(range_tolerance=True)
     variants["without absence"] = BEVGlueConfig(absence=0.0)
     variants["paper()"] = BEVGlueConfig.paper()
     real = [s for seed in SEEDS[:1] for s in real_cars(data, V2V4REAL_TRAIN + V2V4REAL_VAL, (seed,))]

@@ -56,6 +56,7 @@ class BEVGlueConfig(Settings):
         method: "evidence" (ours: stars scored by likelihood ratios, hypotheses carried over time) or "affinity" (the
             paper's). Everything below but `affinity` belongs to "evidence".
         range_tolerance: the tolerance of an edge grows with its length, as far as the heading it hangs on is uncertain.
+            Off by default: refits make the yaw certain, and chance pairs gain more from it (docs/benchmarks.md).
         one_to_one: a box belongs to one pair at most.
         heading_flips: headings are compared modulo pi, and every seed is tried turned by pi as well.
         sizes: lengths and widths count as evidence.
@@ -100,7 +101,7 @@ class BEVGlueConfig(Settings):
     """
 
     method: Literal["evidence", "affinity"] = "evidence"
-    range_tolerance: bool = True
+    range_tolerance: bool = False
     one_to_one: bool = True
     heading_flips: bool = True
     sizes: bool = True
