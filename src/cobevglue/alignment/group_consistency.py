@@ -188,7 +188,7 @@ def _rivals(said: _PairScores, best: int) -> BoolArray:
 
 
 def _coincidence(log_odds: Mapping[tuple[int, int], float], agents: int) -> FloatArray:
-    """(N,) odds that the most certain chain of pairs from agent 0 rests on chance: the shortest path, odds as lengths."""
+    """(N,) odds that the most certain chain of pairs rests on chance: the shortest path, odds as lengths."""
     odds = np.full((agents, agents), np.inf)
     for (i, j), value in log_odds.items():
         odds[i, j] = odds[j, i] = math.exp(min(-value, _LARGEST_EXPONENT)) if value > -np.inf else np.inf
