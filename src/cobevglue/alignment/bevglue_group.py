@@ -92,6 +92,8 @@ class BEVGlueGroup(GroupAligner):
         def refused(reason: str) -> Alignment:
             return Alignment.refused(reason, direct.evidence, direct.margin, max(direct.risk, self.config.risk))
 
+        if not math.isfinite(found.coincidence):
+            return refused(direct.reason or "no chain of pairs of agents leads to it")
         ego_center, other_center = _center(ego), _center(other)
         if direct.ego_SE2_other is not None:
             alone = _between_centers(to_xyyaw(direct.ego_SE2_other), ego_center, other_center)
@@ -105,8 +107,6 @@ class BEVGlueGroup(GroupAligner):
         imprecise = landing_risk(_landing_std(found.covariance, other), self.config.tolerance)
         risk = 1.0 - (1.0 - imprecise) / (1.0 + found.coincidence + found.elsewhere)
         if not risk < self.config.risk:
-            if not math.isfinite(found.coincidence):
-                return refused(direct.reason or "no chain of pairs of agents leads to it")
             cause = "the group has a different pose, too" if found.elsewhere > found.coincidence else direct.reason
             return refused(cause or "too few objects in common with any agent")
         pose, covariance = compose(found.pose, found.covariance, np.array([*-other_center, 0.0]), np.zeros((3, 3)))
