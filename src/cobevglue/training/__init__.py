@@ -1,8 +1,8 @@
-"""Training: samples, augmentation, and the stages: the detector, its heading refinement, then each fusion method.
+"""Training in three stages: the detector, its heading refinement, then each fusion method.
 
     from cobevglue.training import load_config, train_detector
     train_detector(load_config("compact", ["optimisation.epochs=3"]), Path("runs/first"))
-    train_heading(load_heading_config("compact", ["detector=runs/first/last.safetensors"]), Path("runs/facing"))
+    train_heading(load_heading_config("compact", ["detector=runs/first/last.safetensors"]), Path("runs/heading"))
     train_fusion(load_fusion_config("coalign"), Path("runs/coalign"))
 
 `torchrun --nproc-per-node 2 -m cobevglue train detector` trains in two processes.

@@ -1,4 +1,4 @@
-"""Changes a sample at random the way the world could have been different; points and boxes move together."""
+"""Random augmentation of labelled point clouds: mirroring, rotation, scaling, vertical shift, dropped points."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class AugmentationConfig(Settings):
-    """How much samples are changed.
+    """Settings of the augmentation.
 
     Attributes:
-        mirror: share of samples whose left and right are swapped.
-        rotation: turned about z by a uniform angle up to this, either way [rad]. Traffic has no preferred direction
-            where the detector's range is square; where it is long and narrow, much would turn out of it.
-        scaling: made larger or smaller by a uniform factor up to this.
-        z_shift: moved up or down by a uniform distance up to this [m], as sensors are mounted at different heights.
-        drop: share of samples that lose points ...
-        min_keep: ... down to this share of them.
+        mirror: probability of mirroring y.
+        rotation: maximum rotation about z, uniform in both directions [rad]. A detection range that is not square
+            needs a smaller value, because large rotations move objects out of it.
+        scaling: maximum relative change of scale, uniform.
+        z_shift: maximum vertical shift, uniform [m]: sensors are mounted at different heights.
+        drop: probability of dropping points.
+        min_keep: minimum share of the points that are kept where points are dropped.
     """
 
     mirror: _Probability = 0.5
@@ -38,18 +38,18 @@ class AugmentationConfig(Settings):
 
 
 def augment(sample: LabelledCloud, config: AugmentationConfig, random: np.random.Generator) -> LabelledCloud:
-    """A changed copy of a sample.
+    """Augment a sample.
 
     Args:
-        sample: stays as it is.
-        config: how much to change.
-        random: decides; the same state gives the same result.
+        sample: is not modified.
+        config: settings of the augmentation.
+        random: source of randomness; the same state gives the same result.
 
     Returns:
-        The sample in a frame that is mirrored, turned, scaled and shifted. Where points are dropped, the counts are
-        those to be expected, not counted again.
+        A mirrored, rotated, scaled and shifted copy. Where points are dropped, the point counts are expected values
+        and are not computed anew.
     """
-    # All numbers are drawn whatever the settings, so that switching one change off leaves the others as they were.
+    # All numbers are drawn in every case, so that disabling one augmentation does not change the others.
     mirrored = random.random() < config.mirror
     angle = random.uniform(-1.0, 1.0) * config.rotation
     scale = 1.0 + random.uniform(-1.0, 1.0) * config.scaling

@@ -1,4 +1,4 @@
-"""From a sample to what a step of training needs; all of it happens in the data loader's workers."""
+"""Preprocessing of samples and collation of batches, in the workers of the data loader."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ __all__ = ["Batch", "Batches", "Item"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Item:
-    """A sample made ready.
+    """A preprocessed sample.
 
     Attributes:
-        points: (N, 4) those in the detector's range.
-        targets: what the head should say.
-        truth: boxes and the points on each, for validation; None in training.
+        points: (N, 4) x, y, z [m] and intensity of the points in the detector's range.
+        targets: of the head.
+        truth: ground-truth boxes in the detector's range and the number of points on each, for validation; None in
+            training.
     """
 
     points: Tensor
@@ -36,13 +37,13 @@ class Item:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """B items.
+    """A batch of B items.
 
     Attributes:
-        points: (M, 4) of all clouds, one after the other: one tensor is sent between processes faster than many.
-        counts: points of each cloud.
+        points: (M, 4) concatenated clouds: one tensor is transferred between processes faster than many.
+        counts: number of points of each cloud.
         targets: of all clouds.
-        truth: of each, or empty in training.
+        truth: of each cloud; empty in training.
     """
 
     points: Tensor
@@ -51,40 +52,40 @@ class Batch:
     truth: list[tuple[Boxes, IntArray]]
 
     def clouds(self, device: torch.device) -> list[Tensor]:
-        """The clouds (N_i, 4) on a device."""
+        """The B clouds, each (N_i, 4), on `device`."""
         return list(torch.split(self.points.to(device, non_blocking=True), self.counts))
 
     def pin_memory(self) -> Batch:
-        """The same in memory that a GPU can fetch by itself; called by torch's data loader."""
+        """Copy to pinned memory, for asynchronous transfer to a GPU; called by the data loader."""
         t = self.targets
         targets = TargetBatch(*(x.pin_memory() for x in (t.positive, t.residuals, t.direction, t.ignored)))
         return Batch(self.points.pin_memory(), self.counts, targets, self.truth)
 
 
 class Batches:
-    """Makes items of samples, and a batch of items; picklable."""
+    """Preprocesses samples and collates them to batches; picklable."""
 
     def __init__(self, model: PointPillarsConfig, min_points: int, augmentation: AugmentationConfig | None) -> None:
-        """Keep the settings.
+        """Store the settings.
 
         Args:
-            model: of the detector.
-            min_points: objects with fewer are neither targets nor background.
-            augmentation: how samples are changed; None leaves them and keeps their truth, for validation.
+            model: settings of the detector.
+            min_points: objects with fewer points are ignored: neither targets nor background.
+            augmentation: settings; None for validation, without augmentation and with ground truth.
         """
         self._model, self._min_points, self._augmentation = model, min_points, augmentation
         self._anchors = AnchorGrid(model)
 
     def prepare(self, sample: LabelledCloud, random: np.random.Generator) -> Item:
-        """The sample, augmented and cropped, with targets."""
-        sample = replace(sample, points=check_points(sample.points))  # as the detector does when it is used
+        """Augment and crop a sample, and assign its targets."""
+        sample = replace(sample, points=check_points(sample.points))  # as in inference
         if self._augmentation is not None:
             sample = augment(sample, self._augmentation, random)
         boxes, points = sample.boxes, sample.points
         unknown_height = boxes.size[:, 2] <= 0.0
         ignore = (sample.point_count < self._min_points) | unknown_height
         rows = np.column_stack([boxes.center, boxes.size, boxes.yaw])
-        rows[unknown_height, 5] = 1.0  # any: such boxes are no targets, but need a size
+        rows[unknown_height, 5] = 1.0  # arbitrary: these boxes are not targets, but need a size
         truth = None
         if self._augmentation is None:
             inside = self._in_range(boxes.center[:, 0], boxes.center[:, 1])
@@ -93,7 +94,7 @@ class Batches:
         return Item(torch.from_numpy(points), assign_targets(rows, ignore, self._anchors), truth)
 
     def collate(self, items: Sequence[Item]) -> Batch:
-        """A batch of items."""
+        """Collate items to a batch."""
         return Batch(
             points=torch.cat([item.points for item in items]),
             counts=[len(item.points) for item in items],
@@ -102,7 +103,7 @@ class Batches:
         )
 
     def _in_range(self, x: FloatArray | Float32Array, y: FloatArray | Float32Array) -> BoolArray:
-        """(N,) whether the detector looks there, seen from above [m]."""
+        """(N,) whether positions x, y [m] are in the detector's range."""
         (x_min, x_max), (y_min, y_max) = self._model.x_range, self._model.y_range
         inside: BoolArray = (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)
         return inside

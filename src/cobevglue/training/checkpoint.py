@@ -1,4 +1,4 @@
-"""Files of a run: the weights, and all that is needed to go on where it was left."""
+"""Files of a training run: weights, state for resuming, and provenance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cobevglue.datasets.whole_files import whole_file
 __all__ = ["LAST", "STATE", "RunState", "begin_run", "differing_keys", "load_state", "provenance", "save_state"]
 
 STATE, LAST = "state.pt", "last.safetensors"
-"""Files in the folder of every run."""
+"""Names of files in the folder of a run."""
 
 _FORMAT = 1
 _CPU = torch.device("cpu")
@@ -28,16 +28,16 @@ _CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class RunState:
-    """A run at the end of an epoch.
+    """State of a run at the end of an epoch.
 
     Attributes:
-        config: settings of the run, as plain data.
-        processes: how many processes it ran in.
-        epoch: epochs done.
-        elapsed: time spent so far [s].
+        config: settings of the run, JSON-serialisable.
+        processes: number of processes.
+        epoch: number of completed epochs.
+        elapsed: training time so far [s].
         best: the best validation score so far; None before the first validation.
         model: weights.
-        mean_model: their running mean.
+        mean_model: running mean of the weights.
         optimizer: state of the optimiser.
     """
 
@@ -52,18 +52,22 @@ class RunState:
 
 
 def save_state(path: Path, state: RunState) -> None:
-    """Write a run's state; the file is either complete or the one before."""
+    """Write the state of a run atomically."""
     content = {**vars(state), "config": json.dumps(state.config), "format": _FORMAT}
     with whole_file(path) as partial:
         torch.save(content, partial)
 
 
 def load_state(path: Path, device: torch.device) -> RunState:
-    """Read a run's state. Nothing in the file can run code.
+    """Read the state of a run. Code in the file is not executed.
+
+    Args:
+        path: of the file.
+        device: of the tensors that are read.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: the file is broken or of another version; names it.
+        FileNotFoundError: the file does not exist.
+        ValueError: it is damaged or has another format version.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is not there: no epoch of this run was completed")
@@ -73,7 +77,7 @@ def load_state(path: Path, device: torch.device) -> RunState:
         if found != _FORMAT:
             raise ValueError(f"its format is {found}, this version reads {_FORMAT}")
         return RunState(**{**content, "config": json.loads(content["config"])})
-    except Exception as error:  # whatever unpickling broken bytes raises
+    except Exception as error:  # unpickling damaged bytes raises many types of errors
         raise ValueError(f"{path}: not the state of a run: {' '.join(str(error).split())[:200]}") from error
 
 
@@ -86,19 +90,23 @@ def begin_run(
     processes: int = 1,
     device: torch.device = _CPU,
 ) -> RunState | None:
-    """What a run starts from: the state in its folder, or None for nothing.
+    """Check the folder of a run, and load the state to resume from.
 
     Args:
         folder: of the run.
-        settings: of the run, as plain data.
-        free_to_change: names of settings with which a run may go on differently.
-        resume: go on with the run in the folder.
-        processes: how many train together.
-        device: where the state is read to.
+        settings: of the run, JSON-serialisable.
+        free_to_change: names of the top-level settings that may differ when a run is resumed.
+        resume: resume the run in the folder.
+        processes: number of processes that train together.
+        device: of the tensors of the state.
+
+    Returns:
+        The state, or None for a new run.
 
     Raises:
-        FileNotFoundError: there is nothing to resume.
-        ValueError: there is a run already, or one with other settings, or its file is broken.
+        FileNotFoundError: no state to resume from.
+        ValueError: a new run in a folder that contains one; other settings than those of the run to resume; a damaged
+            file.
     """
     file = folder / STATE
     if not resume:
@@ -115,7 +123,7 @@ def begin_run(
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Dotted names of the settings that are not the same in both, sorted."""
+    """Dotted names of the settings that differ, sorted."""
     names: list[str] = []
     for key in sorted({*one, *other}):
         a, b = one.get(key), other.get(key)
@@ -127,7 +135,7 @@ def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any], prefix: str
 
 
 def provenance() -> dict[str, str]:
-    """Where weights come from: versions, git commit (where the package is run from a checkout), command."""
+    """Provenance of weights: versions, git commit (if the package is run from a checkout), command."""
     return {
         "cobevglue": cobevglue.__version__,
         "torch": torch.__version__,
@@ -138,7 +146,7 @@ def provenance() -> dict[str, str]:
 
 
 def _git_commit() -> str:
-    """The checkout's commit, with "+" where tracked files were changed since; "" outside a checkout."""
+    """Commit of the checkout, with "+" if tracked files were modified; "" outside a checkout."""
     folder = Path(cobevglue.__file__).resolve().parents[2]
     if not (folder / ".git").exists():
         return ""

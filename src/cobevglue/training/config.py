@@ -1,4 +1,4 @@
-"""Settings of a training run; the shipped ones by name, and a YAML file or single values that override them."""
+"""Settings of the training of a detector: presets, which a YAML file or single values override."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from cobevglue.training.optimisation import OptimisationConfig
 __all__ = ["PRESETS", "DataConfig", "TrainDetectorConfig", "ValidationConfig", "load_config", "settings_from"]
 
 SIMULATED = "simulated"
-"""Name of the data that are made while training."""
+"""Data source: simulation during training."""
 
 _Count = Annotated[int, Field(ge=1)]
 
 
 class DataConfig(Settings):
-    """Where samples come from.
+    """Source of training and validation samples.
 
     Attributes:
         source: "simulated", or the name of a data set in `DATASETS`.
         root: folder of the data set.
-        split: what to train on; None for the source's own training split.
-        validation_split: what to validate on; None for the source's own validation split.
+        split: training split; None for the default of the source.
+        validation_split: None for the default of the source.
         options: further settings of the source: those of `EpisodeSettings`, or arguments of `DatasetEpisodes`.
         reader: arguments of the data set's class, such as `labels` of DAIR-V2X or `left_handed` of V2V4Real.
-        worlds: simulated worlds to train on, over and over; None for a new one each time.
-        min_points: objects with fewer points are neither to be found nor wrong to find.
-        pool: episodes whose samples are shuffled together, in each worker.
-        uses: how often a sample is seen before it is forgotten, changed in another way each time; more where making
-            samples takes longer than learning from them.
-        workers: processes that make samples, for each training process; 0 makes them in the training process. Another
-            number makes another order of samples.
+        worlds: number of simulated worlds for training; None for a new one in every episode.
+        min_points: objects with fewer points are ignored, in training and validation.
+        pool: number of episodes whose samples are shuffled together, in each worker.
+        uses: number of times that a sample is used, with different augmentations; larger values help where loading
+            or simulation is slower than training.
+        workers: data-loading processes per training process; 0 loads in the training process. The order of samples
+            depends on the number.
     """
 
     source: str = SIMULATED
@@ -64,7 +64,7 @@ class DataConfig(Settings):
         return source
 
     def split_name(self, *, validation: bool) -> str:
-        """The split to train or validate on, the source's own where none is set."""
+        """Name of the training or validation split; the default of the source if none is set."""
         chosen = self.validation_split if validation else self.split
         if chosen is not None:
             return chosen
@@ -75,12 +75,12 @@ class DataConfig(Settings):
 
 
 class ValidationConfig(Settings):
-    """How the model is measured while it is trained.
+    """Settings of validation during training.
 
     Attributes:
-        every: epochs between validations; the last epoch is always validated.
-        episodes: the first episodes of the validation split; they stay in memory. 0 for no validation.
-        score: "ap_0.5" or "ap_0.7", by which the best model is chosen.
+        every: number of epochs between validations; the last epoch is always validated.
+        episodes: number of episodes of the validation split, kept in memory; 0 disables validation.
+        score: metric by which the best model is selected, "ap_0.5" or "ap_0.7".
     """
 
     every: _Count = 1
@@ -92,16 +92,16 @@ class TrainDetectorConfig(Settings):
     """Settings of `train_detector`.
 
     Attributes:
-        model: of the detector; a name in `CONFIGS` is taken, too.
-        data: what to train on.
-        augmentation: how samples are changed.
-        optimisation: how weights are found.
-        validation: how they are measured.
-        seed: of the first weights, the order of samples and their changes.
-        init_from: weights to start from, a file of an earlier run; the schedule starts anew.
-        device: "auto" takes CUDA where there is one.
-        threads: of torch on the CPU, in each training process; workers have one each.
-        report_every: time between lines of progress [s].
+        model: settings of the detector, or a name in `CONFIGS`.
+        data: source of samples.
+        augmentation: settings.
+        optimisation: settings.
+        validation: settings.
+        seed: of the initial weights, the order of samples and the augmentation.
+        init_from: file of initial weights; the learning rate schedule starts anew.
+        device: torch's name of a device, or "auto": CUDA if available.
+        threads: number of torch's CPU threads in each training process; workers use one each.
+        report_every: time between progress messages [s].
     """
 
     model: PointPillarsConfig = CONFIGS["compact"]
@@ -126,19 +126,18 @@ class TrainDetectorConfig(Settings):
 
 
 FREE_TO_CHANGE = {"device", "threads", "report_every", "init_from"}
-"""A run may be resumed with other values of these."""
+"""Settings that may differ when a run is resumed."""
 
 PRESETS: dict[str, TrainDetectorConfig] = {
-    # As many samples as two cores get through in about an hour and a half. What an agent sees lies along its road, so
-    # scenes are turned by no more than roads are, and not mirrored: which side traffic keeps to says which way a far
-    # vehicle faces.
+    # About 90 minutes on two cores. Most objects are along the agent's road, so rotations are limited to those of
+    # roads. Scenes are not mirrored: the side of the road on which a distant vehicle drives indicates its heading.
     "compact": TrainDetectorConfig(
         data=DataConfig(min_points=2),
         augmentation=AugmentationConfig(mirror=0.0, rotation=0.4),
         optimisation=OptimisationConfig(epochs=24, samples_per_epoch=500),
         validation=ValidationConfig(every=5, episodes=8),
     ),
-    # What a GPU gets through in six minutes while 15 cores simulate for it.
+    # Six minutes on a GPU, with 15 cores for the simulation.
     "opv2v": TrainDetectorConfig(
         model=CONFIGS["opv2v"],
         data=DataConfig(min_points=2, uses=2, workers=15),
@@ -146,7 +145,7 @@ PRESETS: dict[str, TrainDetectorConfig] = {
         optimisation=OptimisationConfig(epochs=16, samples_per_epoch=6000, batch_size=16),
         validation=ValidationConfig(every=8, episodes=12),
     ),
-    # Seconds, to see that everything works; it finds nothing.
+    # Seconds, to test the installation; the result detects nothing.
     "tiny": TrainDetectorConfig(
         optimisation=OptimisationConfig(epochs=2, samples_per_epoch=8, batch_size=2),
         data=DataConfig(worlds=1, pool=1, workers=0),
@@ -154,20 +153,20 @@ PRESETS: dict[str, TrainDetectorConfig] = {
         report_every=1.0,
     ),
 }
-"""Shipped settings by name."""
+"""Presets by name."""
 
 
 def load_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainDetectorConfig:
-    """Settings by the name of a preset or from a YAML file, with single values changed.
+    """Load settings from a preset or a YAML file, and override single values.
 
     Args:
-        name_or_file: a name in `PRESETS`, or a `.yaml` file with what differs from the default, or from the preset that
-            its key `preset` names.
-        changes: "key=value", with dots into nested settings and the value in YAML: "optimisation.epochs=3".
+        name_or_file: a name in `PRESETS`, or a `.yaml` file of overrides of a preset. The key `preset` names the
+            preset; the default is "compact".
+        changes: "key=value", with dots for nested settings and the value in YAML: "optimisation.epochs=3".
 
     Raises:
-        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
-        FileNotFoundError: there is no such file.
+        ValueError: unknown preset, unknown key or bad value; the message names the nearest valid key.
+        FileNotFoundError: the file does not exist.
     """
     return settings_from(PRESETS, "compact", name_or_file, changes)
 
@@ -178,7 +177,7 @@ Config = TypeVar("Config", bound=Settings)
 def settings_from(
     presets: Mapping[str, Config], default: str, name_or_file: str, changes: Sequence[str] = ()
 ) -> Config:
-    """See `load_config`; `default` is the preset of a file that names none."""
+    """`load_config` for any family of presets; `default` is the preset of a file without the key `preset`."""
     overrides: dict[str, Any] = {}
     preset, where = name_or_file, ""
     if name_or_file.endswith((".yaml", ".yml")):
@@ -215,7 +214,7 @@ def _one_change(change: str) -> dict[str, Any]:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise ValueError(f"{change!r}: the value is not readable as YAML") from None
-    if isinstance(value, str):  # YAML 1.1 takes 1e-3 for text
+    if isinstance(value, str):  # in YAML 1.1, 1e-3 is a string
         with contextlib.suppress(ValueError):
             value = float(value)
     for name in reversed(key.split(".")):
@@ -224,7 +223,7 @@ def _one_change(change: str) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with `changes` put in, mapping by mapping; neither is changed."""
+    """Merge nested mappings: `base` overridden by `changes`; the arguments are not modified."""
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)

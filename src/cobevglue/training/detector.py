@@ -1,4 +1,4 @@
-"""The training of a detector: `train_detector`."""
+"""Training of a detector: `train_detector`."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ BEST = "best.safetensors"
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """How a run ended.
+    """Result of a training run.
 
     Attributes:
         folder: with `last.safetensors`, `best.safetensors` (of the best validation), `state.pt`, `log.jsonl` and
             TensorBoard's event files.
-        epochs: done so far.
-        finished: all epochs are done; otherwise the time was up, and the run can be resumed.
-        metrics: of the last validation; empty without any.
-        best: the best validation score; None without any.
+        epochs: number of completed epochs.
+        finished: whether all epochs are completed; if not, the time limit was reached, and the run can be resumed.
+        metrics: of the last validation; empty without validation.
+        best: the best validation score; None without validation.
     """
 
     folder: Path
@@ -62,26 +62,26 @@ def train_detector(
     validation_source: EpisodeSource | None = None,
     report: Callable[[str], None] = print_progress,
 ) -> TrainingResult:
-    """Train a detector, or go on with a run that was interrupted.
+    """Train a detector, or resume a run.
 
-    State is saved after each epoch. A resumed run continues exactly as the uninterrupted one would have, on the same
-    machine and with the same number of threads. Under `torchrun` all processes train together, each with batches of its
-    own.
+    The state is saved after each epoch. On the same machine with the same number of threads, a resumed run gives
+    exactly the result of an uninterrupted one. Under `torchrun`, all processes train together, each on its own batches.
 
     Args:
         config: settings.
-        folder: of the run; made where missing.
-        resume: go on with the run in `folder`.
-        max_minutes: stop after the last epoch that is done in this time, as far as one can tell from the one before. A
-            first epoch is always done.
-        source: what to train on, in the place of `config.data`'s.
-        validation_source: what to validate on, likewise.
-        report: takes lines of progress.
+        folder: of the run; created if missing.
+        resume: resume the run in `folder`.
+        max_minutes: time limit: stop before an epoch that would exceed it, judged by the longest one so far. The first
+            epoch is always completed.
+        source: training samples, instead of those of `config.data`.
+        validation_source: validation samples, instead of those of `config.data`.
+        report: is called with each line of progress.
 
     Raises:
-        ValueError: the folder has a run already, or one with other settings; a device that is not there; a broken file.
-        FileNotFoundError: nothing to resume, or no such data or weights.
-        DivergedError: the loss is not finite any more.
+        ValueError: a new run in a folder that contains one; other settings than those of the run to resume; an
+            unavailable device; a damaged file.
+        FileNotFoundError: no state to resume from, or missing data or weights.
+        DivergedError: the loss is not finite.
     """
     source = source or make_source(config.data, config.seed, validation=False)
     if config.validation.episodes and validation_source is None:
@@ -109,7 +109,7 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.model = PointPillars(config.model)  # its convolutions are channels-last
-        self.model.heading_refiner.requires_grad_(False)  # looks at what was found: `train_heading`, afterwards
+        self.model.heading_refiner.requires_grad_(False)  # trained afterwards by `train_heading`
         self.model.to(processes.device)
         self.loss = DetectionLoss(config.model)
         self.epoch, self.elapsed = 0, 0.0
@@ -129,13 +129,13 @@ class _Run:
             self.epoch, self.elapsed, self.best = state.epoch, state.elapsed, state.best
         self.net = self._distributed()
         if processes.device.type == "cuda":
-            # Clouds become images of one size, so the fastest kernels need to be looked for only once.
+            # All pillar images have the same size, so the search for the fastest kernels runs only once.
             torch.backends.cudnn.benchmark = True
 
     def train(
         self, source: EpisodeSource, validation_source: EpisodeSource | None, max_minutes: float | None
     ) -> TrainingResult:
-        """All epochs that are left, or as many as there is time for."""
+        """Run the remaining epochs within the time limit."""
         config, processes = self.config, self.processes
         validation = None
         if validation_source is not None and config.validation.episodes:
@@ -166,7 +166,7 @@ class _Run:
         return TrainingResult(self.folder, self.epoch, finished, metrics, self.best)
 
     def _batches(self, source: EpisodeSource) -> Iterator[Batch]:
-        """Of all epochs that are left, so that workers are ahead while this process validates or saves."""
+        """Batches of all remaining epochs: workers prefetch while this process validates or saves."""
         config, optimisation = self.config, self.config.optimisation
         ready = Batches(config.model, config.data.min_points, config.augmentation)
         stream = EpisodeStream(
@@ -208,7 +208,7 @@ class _Run:
             progress.add({**terms._asdict(), "gradient": norm}, rate, waited)
 
     def _validate(self, validation: Validation, log: RunLog) -> dict[str, float]:
-        """The numbers of the mean weights, the same in all processes; the best model so far is saved."""
+        """Validate the mean weights and save the best model so far; returns the same metrics in all processes."""
         started = time.monotonic()
         metrics: dict[str, float] = self.processes.share(validation.measure(self.learner.mean))
         log.add("validation", self.epoch * self.batches_per_epoch, self.epoch, metrics)
@@ -242,13 +242,13 @@ class _Run:
         if self.processes.count == 1:
             return self.model
         cuda = self.processes.device.type == "cuda"
-        # The layers are replaced within the model, with the same parameters: optimiser and checkpoints do not notice.
+        # The layers are replaced in place with the same parameters, so optimiser and checkpoints are unaffected.
         model: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(self.model) if cuda else self.model  # type: ignore[no-untyped-call]
         return DistributedDataParallel(model, device_ids=[self.processes.device] if cuda else None)
 
 
 def _start_from(model: PointPillars, path: Path) -> None:
-    """Weights of an earlier run; other ranges and thresholds are fine, another network is not."""
+    """Load initial weights. Ranges and thresholds may differ, the network may not."""
     theirs, ours = PointPillars.load(path).state_dict(), model.state_dict()
     wrong = [
         name

@@ -1,4 +1,4 @@
-"""The epochs of a training in one process: logged, timed, saved after each, and continued where they were left."""
+"""Loop over the epochs of a training run in one process, with logging, checkpoints and resuming."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def run_epochs(
     validate: Callable[[], dict[str, float]],
     save: Callable[[dict[str, object]], None],
 ) -> dict[str, float]:
-    """Run all epochs that are left.
+    """Run all remaining epochs.
 
     Args:
-        config: settings of the run, for its files.
-        folder: of the run; made where missing. Its state is saved after each epoch.
-        learner: what is trained.
-        state: what `begin_run` returned.
-        train: trains one epoch, given its number from 0.
-        validate: measures after the last epoch; empty where there is nothing to measure on.
+        config: settings of the run, stored in its files.
+        folder: of the run; created if missing. The state is saved after each epoch.
+        learner: model and optimiser.
+        state: the result of `begin_run`.
+        train: trains one epoch, given its index from 0.
+        validate: returns metrics after the last epoch; empty without validation data.
         save: writes the weights after each epoch, given their metadata.
 
     Returns:
-        What `validate` measured; empty if no epoch was left.
+        The result of `validate`; empty if no epochs remained.
 
     Raises:
-        DivergedError: the loss is not finite any more.
+        DivergedError: the loss is not finite.
     """
     first, elapsed = (0, 0.0) if state is None else (state.epoch, state.elapsed)
     epochs, steps = learner.config.epochs, learner.config.steps_per_epoch()

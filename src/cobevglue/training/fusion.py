@@ -1,4 +1,4 @@
-"""The training of a fusion method on the frozen features of a detector: `train_fusion`. Minutes on a CPU."""
+"""Training of a fusion method on the frozen features of a detector: `train_fusion`. Takes minutes on a CPU."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from cobevglue.training.run_log import RunLog, print_progress
 __all__ = ["FUSION_PRESETS", "TrainFusionConfig", "load_fusion_config", "train_fusion"]
 
 TEACHER = "disconet-teacher"
-"""In the place of a method's name: what DiscoNet learns from."""
+"""Name of DiscoNet's teacher, in place of a method's name."""
 
 _NORM_MOMENTUM = 0.1
-"""Of the norms' running statistics: a hundredth, as the detector has it, would still remember the start after a run."""
+"""Momentum of the batch normalisation: with the detector's 0.01 the initial statistics would not decay in a run."""
 
 _SAMPLE_STREAM = 90
 
@@ -48,19 +48,19 @@ class TrainFusionConfig(Settings):
 
     Attributes:
         method: a name in `FUSION_METHODS` that shares features, or "disconet-teacher".
-        detector: whose features; a name of shipped weights, or a file of a run.
-        features: folder of the frozen features, shared by all methods; what is missing is computed first.
-        train: frames to train on.
-        validation: frames to validate on, after the last epoch.
-        alone: share of samples in which nobody but the ego is there.
-        noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose; None for what the method's
-            paper has.
-        teacher: weights of DiscoNet's teacher; None for none.
-        optimisation: how weights are found.
-        seed: of the first weights, the order of samples and their noise.
-        threads: of torch; as many processes make features.
-        workers: processes that read samples.
-        report_every: time between lines of progress [s].
+        detector: name of shipped weights, or file of a run; its features are frozen.
+        features: folder of the frozen features, shared by all methods; missing ones are computed first.
+        train: training frames.
+        validation: validation frames, used after the last epoch.
+        alone: share of samples with the ego as the only agent.
+        noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose; None for the value of the
+            method's paper.
+        teacher: weights of DiscoNet's teacher; None trains without distillation.
+        optimisation: settings.
+        seed: of the initial weights, the order of samples and the pose noise.
+        threads: number of torch's threads, and of processes that compute features.
+        workers: number of data-loading processes; 0 loads in the training process.
+        report_every: time between progress messages [s].
     """
 
     method: str
@@ -81,7 +81,7 @@ class TrainFusionConfig(Settings):
 
 
 FREE_TO_CHANGE = {"features", "threads", "workers", "report_every", "teacher"}
-"""A run may be resumed with other values of these."""
+"""Settings that may differ when a run is resumed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,10 +91,10 @@ class _Item:
 
 
 class _Samples(Dataset[_Item]):
-    """The samples of one epoch, made ready: frames in a new order, with poses as the ego believes them.
+    """The preprocessed samples of one epoch: frames in random order, with pose noise.
 
-    Any agent of a frame may be the ego. Merged clouds are known for one of them only: where they are learnt from, it is
-    that one.
+    The ego is a random agent of the frame. Features of the merged cloud exist for the first agent only, so it is the
+    ego for methods that use them (`merged`).
     """
 
     def __init__(
@@ -134,18 +134,19 @@ def train_fusion(
     resume: bool = False,
     report: Callable[[str], None] = print_progress,
 ) -> TrainingResult:
-    """Train what a method has beyond the encoder, or go on with a run that was interrupted.
+    """Train a fusion method, with the encoder frozen, or resume a run.
 
     Args:
         config: settings.
-        folder: of the run; made where missing. State is saved after each epoch.
-        resume: go on with the run in `folder`.
-        report: takes lines of progress.
+        folder: of the run; created if missing. The state is saved after each epoch.
+        resume: resume the run in `folder`.
+        report: is called with each line of progress.
 
     Raises:
-        ValueError: a method that has nothing to train; a folder that has a run already, or one with other settings.
-        FileNotFoundError: nothing to resume, or no such weights.
-        DivergedError: the loss is not finite any more.
+        ValueError: a method without weights; a new run in a folder that contains one; other settings than those of the
+            run to resume.
+        FileNotFoundError: no state to resume from, or missing weights.
+        DivergedError: the loss is not finite.
     """
     with torch_threads(config.threads):
         return _train(config, folder, resume, report)
@@ -212,9 +213,9 @@ def _train_epoch(
 
 
 def _validate(model: IntermediateFusion, frames: FusionFrames, report: Callable[[str], None]) -> dict[str, float]:
-    """AP in the detector's range on true poses; objects that are ignored in training are here, too."""
+    """AP in the detector's range with true poses; objects that training ignores are ignored here, too."""
     found = []
-    rng = np.random.default_rng(0)  # draws nothing: there is no noise
+    rng = np.random.default_rng(0)  # has no effect: the noise is 0
     with torch.inference_mode():
         for index in range(len(frames)):
             frame = frames[index]
@@ -231,7 +232,7 @@ def _validate(model: IntermediateFusion, frames: FusionFrames, report: Callable[
 
 
 def _sample(frame: FusionFrame, agents: int, noise: tuple[float, float], rng: np.random.Generator) -> FusionSample:
-    """The first agents of a frame, with noise on every agent's pose, the ego's included."""
+    """Sample of the first `agents` of a frame, with noise on the pose of every agent, the ego included."""
     world_SE2_true = [SE2.from_matrix(pose) for pose in frame.world_SE3_agent[:agents]]
     deviation = np.array([noise[0], noise[0], math.radians(noise[1])])
     world_SE2_claimed = [
@@ -267,7 +268,7 @@ def _make_model(config: TrainFusionConfig, detector: PointPillars) -> Intermedia
 
 _DEFAULT = TrainFusionConfig.model_fields["optimisation"].default
 _SLOWER = {"fpv-rcnn", "v2vnet-robust", "v2x-vit"}
-"""With layers that were tried at a third of the learning rate only."""
+"""Methods that were tried only at a third of the default learning rate."""
 
 FUSION_PRESETS: dict[str, TrainFusionConfig] = {
     name: TrainFusionConfig(
@@ -281,14 +282,14 @@ FUSION_PRESETS[TEACHER] = TrainFusionConfig(method=TEACHER)
 FUSION_PRESETS["disconet"] = TrainFusionConfig(
     method="disconet", teacher=Path("runs/fusion") / TEACHER / "last.safetensors"
 )
-"""Shipped settings by the name of the method."""
+"""Presets by the name of the method."""
 
 
 def load_fusion_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainFusionConfig:
-    """Settings by the name of a method or from a YAML file, with single values changed; see `load_config`.
+    """Load settings by the name of a method or from a YAML file, and override single values; see `load_config`.
 
     Raises:
-        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
-        FileNotFoundError: there is no such file.
+        ValueError: unknown preset, unknown key or bad value; the message names the nearest valid key.
+        FileNotFoundError: the file does not exist.
     """
     return settings_from(FUSION_PRESETS, "cobevglue", name_or_file, changes)

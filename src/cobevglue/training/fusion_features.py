@@ -1,7 +1,7 @@
-"""What the fusion methods are trained on: the frozen detector's view of many frames, computed once and kept on disk.
+"""Training data of the fusion methods: features of the frozen detector for simulated frames, precomputed on disk.
 
-A folder has an `index.json` with the settings and one safetensors file a frame, about 10 MB with three agents: the
-encoder's maps in float16, detections, points, true poses, and the objects to find. The first agent is the ego.
+A folder contains `index.json` with the settings and one safetensors file per frame, about 10 MB with three agents: the
+encoder's maps in float16, detections, points, true poses, and the ground truth. The first agent is the ego.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _EGO_STREAM = 80
 
 
 class FeatureConfig(Settings):
-    """Which simulated frames.
+    """Settings of the simulated frames.
 
     Attributes:
         split: of the simulated worlds.
-        scenarios: drives, each in another world.
-        frames: of each drive.
-        interval: between frames [s].
-        agents: how many see each drive, one number after the other.
-        seed: of the drives.
-        min_points: an object with fewer points of all agents together is neither to be found nor wrong to find.
+        scenarios: number of scenarios, each in a different world.
+        frames: number of frames per scenario.
+        interval: time between frames [s].
+        agents: number of agents per scenario; successive scenarios cycle through the values.
+        seed: of the scenarios.
+        min_points: objects with fewer points, summed over all agents, are ignored.
     """
 
     split: str = "train"
@@ -64,14 +64,14 @@ class FeatureConfig(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusionFrame:
-    """One frame as several agents saw it, the ego first.
+    """One frame of n agents, the ego first.
 
     Attributes:
-        seen: what each of the n agents saw, each in its own LiDAR frame.
-        world_SE3_agent: (n, 4, 4) true poses.
-        early_features: the encoder's three maps of the merged cloud, in the ego's frame; None where they are not known.
-        truth: objects that any agent could see, in the ego's frame.
-        ignored: (K,) which of them are neither to be found nor wrong to find: hardly any points, or the ego itself.
+        observations: outputs of perception of the n agents, each in its own LiDAR frame.
+        world_SE3_agent: (n, 4, 4) true poses of the agents' LiDAR frames.
+        early_features: the encoder's three maps of the merged cloud, in the ego's frame; None if not computed.
+        truth: K objects visible to any agent, in the ego's frame.
+        ignored: (K,) True for objects that are ignored: with too few points, or the ego itself.
     """
 
     observations: tuple[PerceptionOutput, ...]
@@ -81,7 +81,7 @@ class FusionFrame:
     ignored: BoolArray
 
     def with_ego(self, number: int) -> FusionFrame:
-        """The same frame with agent `number` as the ego; the vehicle of the ego before stays ignored."""
+        """The same frame with agent `number` as the ego; the vehicle of the previous ego stays ignored."""
         if number == 0:
             return self
         order = [number, *(other for other in range(len(self.observations)) if other != number)]
@@ -92,7 +92,7 @@ class FusionFrame:
 
 
 def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_points: int) -> FusionFrame:
-    """What the detector sees of a frame.
+    """Compute the features of a frame.
 
     Args:
         frame: with clouds of these agents.
@@ -101,7 +101,7 @@ def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_
         min_points: see `FeatureConfig`.
 
     Raises:
-        ValueError: an agent has no cloud.
+        ValueError: the frame has no cloud of an agent.
     """
     clouds = [_cropped(frame, agent, detector.config) for agent in agents]
     poses = np.stack([frame.agents[agent].world_SE3_lidar for agent in agents])
@@ -120,13 +120,13 @@ def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_
 
 
 class FusionFrames:
-    """Frames on disk: `frames[i]`."""
+    """Sequence of frames on disk; `frames[i]` reads one."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder that `write_features` has finished.
+        """Open a folder that `write_features` completed.
 
         Raises:
-            FileNotFoundError: there is none.
+            FileNotFoundError: the folder is missing or incomplete.
         """
         content = read_index(folder)
         self.config = FeatureConfig.model_validate(content["config"])
@@ -147,19 +147,19 @@ def write_features(
     report: Callable[[str], None] = print_progress,
     processes: int = 1,
 ) -> FusionFrames:
-    """Compute features, or what is missing of them; a finished folder of the same settings is taken as it is.
+    """Compute the features that are missing in a folder, and open it.
 
     Args:
-        folder: made where missing.
-        config: which frames.
+        folder: created if missing.
+        config: settings of the frames.
         detector: in evaluation mode.
-        report: takes lines of progress.
-        processes: how many make drives side by side, with one thread each; features differ in
-            their last digit between one and many.
+        report: is called with each line of progress.
+        processes: number of processes, with one thread each. One and several processes differ in floating-point
+            rounding, because the numbers of threads differ.
 
     Raises:
-        ValueError: the folder was made with other settings or another detector.
-        ModuleNotFoundError: what simulates is not installed.
+        ValueError: the folder was written with other settings or another detector.
+        ModuleNotFoundError: the packages for simulation are not installed.
     """
     wanted = {"config": json.loads(config.model_dump_json()), "encoder": fingerprint(detector)}
 
@@ -183,7 +183,7 @@ def _write_scenario(folder: Path, config: FeatureConfig, detector: PointPillars,
 
 
 def _frames(number: int, config: FeatureConfig, detector: PointPillars) -> Iterator[FusionFrame]:
-    """The frames of a drive that at least two agents see, each with another ego."""
+    """The frames of a scenario with at least two agents (one, if the scenario has one), with a random ego each."""
     agents = config.agents[number % len(config.agents)]
     settings = ScenarioSettings(frames=config.frames, rate=1.0 / config.interval, agents=agents)
     scenario = simulated_scenario(config.split, number, config.seed, settings)
@@ -195,7 +195,7 @@ def _frames(number: int, config: FeatureConfig, detector: PointPillars) -> Itera
 
 
 def _cropped(frame: Frame, agent: str, config: PointPillarsConfig) -> Float32Array:
-    """The agent's points in the detector's range."""
+    """Points of an agent in the detector's range, (N, 4)."""
     points = frame.agents[agent].points
     if points is None:
         raise ValueError(f"{frame.scenario}/{frame.timestamp}: {agent}: no cloud is stored")
@@ -243,7 +243,7 @@ def _read(file: Path) -> FusionFrame:
 
 
 def _rows(boxes: Boxes) -> FloatArray:
-    """(N, 9) x, y, z, l, w, h [m], yaw [rad], score (1 where there is none), track id (the row where there is none)."""
+    """(N, 9) x, y, z, l, w, h [m], yaw [rad], score (default 1), track id (default: the row)."""
     score = np.ones(len(boxes)) if boxes.score is None else boxes.score
     ids = np.arange(len(boxes)) if boxes.track_id is None else boxes.track_id
     rows: FloatArray = np.column_stack([boxes.center, boxes.size, boxes.yaw, score, ids])

@@ -1,4 +1,4 @@
-"""The training of a detector's heading refinement, which tells front from back: `train_heading`. Minutes on a CPU."""
+"""Training of a detector's heading refinement: `train_heading`. Takes minutes on a CPU."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 
 class HeadingAugmentation(Settings):
-    """How looks are changed, so that nothing in them is relied on alone: other shapes, other sensors, other traffic.
+    """Settings of the augmentation: variation of shapes, sensors and traffic, and dropout of inputs.
 
     Attributes:
-        thinning: up to this share of the points on a vehicle is dropped.
-        jitter: standard deviation by which each point is moved along each axis [m].
-        stretch: a vehicle's points are stretched along each axis by a factor between 1 - this and 1 + this.
-        alone: share of vehicles around which no other is seen.
-        unsure: share of vehicles of which the head's opinion is not known.
+        thinning: maximum share of the points on a vehicle that are dropped.
+        jitter: standard deviation of the noise on each coordinate of a point [m].
+        stretch: maximum relative change of scale along each axis.
+        alone: share of vehicles whose surrounding boxes are removed.
+        unsure: share of vehicles whose heading confidence is set to 0.
     """
 
     thinning: _Share = 0.7
@@ -65,18 +65,18 @@ class TrainHeadingConfig(Settings):
     """Settings of `train_heading`.
 
     Attributes:
-        detector: that looks a second time; a name of shipped weights, or a file of a run. All else in it stays.
-        data: clouds; how their samples are shuffled does not matter here.
-        episodes: of the data, to train on.
-        validation_episodes: to measure on, after the last epoch.
-        examples: folder for what the detector finds in them; what is missing is computed first.
-        augmentation: how what is seen of a vehicle is changed.
-        optimisation: how weights are found; a sample is a vehicle.
-        seed: of the episodes, the first weights and the order of samples.
-        init_from: a detector, named like `detector`, whose heading refinement is where to start.
-        device: looks at clouds and learns; "auto" takes CUDA where there is one.
-        threads: of torch; as many processes look at clouds.
-        report_every: time between lines of progress [s].
+        detector: name of shipped weights, or file of a run. Its other weights are not changed.
+        data: source of clouds; `pool`, `uses` and `workers` have no effect here.
+        episodes: number of training episodes.
+        validation_episodes: number of validation episodes, used after the last epoch.
+        examples: folder of the examples (detections in the clouds); missing ones are computed first.
+        augmentation: settings.
+        optimisation: settings; a sample is a vehicle.
+        seed: of the episodes, the initial weights, the order of samples and the augmentation.
+        init_from: a detector, given as for `detector`, with the initial weights of the heading refinement.
+        device: torch's name of a device, or "auto": CUDA if available.
+        threads: number of torch's threads, and of processes that compute examples.
+        report_every: time between progress messages [s].
     """
 
     detector: str = "compact"
@@ -96,7 +96,7 @@ class TrainHeadingConfig(Settings):
 
 
 FREE_TO_CHANGE = {"examples", "device", "threads", "report_every"}
-"""A run may be resumed with other values of these."""
+"""Settings that may differ when a run is resumed."""
 
 
 def train_heading(
@@ -106,18 +106,19 @@ def train_heading(
     resume: bool = False,
     report: Callable[[str], None] = print_progress,
 ) -> TrainingResult:
-    """Train heading refinement of a detector, or go on with a run that was interrupted.
+    """Train the heading refinement of a detector, or resume a run.
 
     Args:
         config: settings.
-        folder: of the run; made where missing. State is saved after each epoch; `last.safetensors` is the detector.
-        resume: go on with the run in `folder`.
-        report: takes lines of progress.
+        folder: of the run; created if missing. The state is saved after each epoch; `last.safetensors` is the whole
+            detector.
+        resume: resume the run in `folder`.
+        report: is called with each line of progress.
 
     Raises:
-        ValueError: a folder that has a run already, or one with other settings; bad data.
-        FileNotFoundError: nothing to resume, or no such weights or data.
-        DivergedError: the loss is not finite any more.
+        ValueError: a new run in a folder that contains one; other settings than those of the run to resume; bad data.
+        FileNotFoundError: no state to resume from, or missing weights or data.
+        DivergedError: the loss is not finite.
     """
     with torch_threads(config.threads):
         return _train(config, folder, resume, chosen_device(config.device), report)
@@ -127,7 +128,7 @@ def _train(
     config: TrainHeadingConfig, folder: Path, resume: bool, device: torch.device, report: Callable[[str], None]
 ) -> TrainingResult:
     detector = PointPillars.named(config.detector)
-    # How the detector came about stays known; of an earlier heading refinement nothing is left.
+    # Keep the training metadata of the detector, except that of a heading refinement, which is replaced.
     earlier = detector.metadata.get("stages", [detector.metadata])
     detector.metadata = {"stages": [stage for stage in earlier if stage.get("stage") != _STAGE]}
     state = begin_run(folder, config.model_dump(mode="json"), FREE_TO_CHANGE, resume=resume, device=device)
@@ -163,7 +164,7 @@ def _examples(
     device: torch.device,
     report: Callable[[str], None],
 ) -> HeadingExamples:
-    """What the detector finds in the training or the validation split, on `device`."""
+    """Examples of the training split, or of the validation split if `measured`, on `device`."""
     split = config.data.split_name(validation=measured)
     described = {
         **config.data.model_dump(mode="json", exclude={"split", "validation_split", "pool", "uses", "workers"}),
@@ -205,12 +206,12 @@ def _train_epoch(
 
 
 def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.Generator) -> HeadingInputs:
-    """Other looks at the same K vehicles, which face as before.
+    """Augment the inputs for K vehicles; their true headings do not change.
 
     Args:
-        looks: points in float32.
-        config: how much is changed.
-        random: torch's, on the device of the looks.
+        looks: inputs, with points in float32.
+        config: settings of the augmentation.
+        random: generator on the device of the inputs.
     """
     points, number, vehicle, around = looks
     k, most = points.shape[:2]
@@ -220,7 +221,7 @@ def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.G
 
     left = (number * (1.0 - config.thinning * uniform(k))).ceil().long()
     behind = torch.arange(most, device=points.device) >= number[:, None]
-    order = (uniform(k, most) + behind).argsort(dim=1)  # those that are there first, in any order
+    order = (uniform(k, most) + behind).argsort(dim=1)  # random order, padding last
     points = points.gather(1, order[..., None].expand(-1, -1, 3))
     points = points * (1.0 + config.stretch * (2.0 * uniform(k, 1, 3) - 1.0))
     points = points + config.jitter * torch.randn(points.shape, generator=random, device=points.device)
@@ -231,7 +232,7 @@ def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.G
 
 @torch.inference_mode()
 def _validate(net: HeadingRefiner, examples: HeadingExamples, report: Callable[[str], None]) -> dict[str, float]:
-    """The loss, and the share of vehicles that are the wrong way round, without heading refinement and with it."""
+    """The loss, and the share of vehicles with a heading error above 90 degrees before and after refinement."""
     right = examples.right
     every = torch.arange(len(right), device=right.device)
     logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(every, 1024)])
@@ -248,14 +249,14 @@ HEADING_PRESETS: dict[str, TrainHeadingConfig] = {
     "compact": TrainHeadingConfig(),
     "opv2v": TrainHeadingConfig(detector="opv2v"),
 }
-"""Shipped settings by the name of the detector."""
+"""Presets by the name of the detector."""
 
 
 def load_heading_config(name_or_file: str, changes: Sequence[str] = ()) -> TrainHeadingConfig:
-    """Settings by name or from a YAML file, with single values changed; see `load_config`.
+    """Load settings by name or from a YAML file, and override single values; see `load_config`.
 
     Raises:
-        ValueError: no such preset, an unknown key or a bad value; names the nearest valid one.
-        FileNotFoundError: there is no such file.
+        ValueError: unknown preset, unknown key or bad value; the message names the nearest valid key.
+        FileNotFoundError: the file does not exist.
     """
     return settings_from(HEADING_PRESETS, "compact", name_or_file, changes)

@@ -1,6 +1,6 @@
-"""What front and back are learnt from: vehicles that a detector found, and whether it had them the right way round.
+"""Examples for the training of heading refinement: detected vehicles, and whether their headings are correct.
 
-A folder has one safetensors file for each episode of the source, see `shards`.
+A folder contains one safetensors file per episode of the source, see `shards`.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ from cobevglue.training.shards import read_index, write_shards
 __all__ = ["HeadingExamples", "examples_in", "write_heading_examples"]
 
 _FOUND = 0.5
-"""Overlap with an object from which on a box is of it, as where average precision is measured."""
+"""Minimum bird's-eye-view IoU of a detection and its object, as in the evaluation of AP@0.5."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingExamples:
-    """Vehicles that were found.
+    """K detected vehicles.
 
     Attributes:
-        looks: of K vehicles; points in float16, which is millimetres.
-        right: (K,) whether each box faces as its vehicle does.
+        looks: inputs of the refinement; points in float16, which resolves millimetres.
+        right: (K,) whether the heading of each detection is within 90 degrees of the true one.
     """
 
     looks: HeadingInputs
     right: Tensor
 
     def to(self, device: torch.device) -> HeadingExamples:
-        """The same on another device."""
+        """Copy to a device."""
         return HeadingExamples(HeadingInputs(*(values.to(device) for values in self.looks)), self.right.to(device))
 
     def take(self, rows: Tensor) -> HeadingExamples:
-        """Those in these rows, in the precision of a network."""
+        """The examples in `rows` (R,), with points in float32."""
         looks = HeadingInputs(*(values[rows] for values in self.looks))
         return HeadingExamples(looks._replace(points=looks.points.float()), self.right[rows])
 
 
 @torch.inference_mode()
 def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -> HeadingExamples:
-    """What the detector finds in a cloud, without what is no object or one with fewer points than `min_points`."""
+    """Examples of the detections in a cloud, without false positives and objects of fewer than `min_points` points."""
     points = check_points(cloud.points)
     points = correct_height(points, estimate_height_correction(points))
     (found,) = detector.boxes(detector([torch.from_numpy(points)]))
@@ -83,21 +83,21 @@ def write_heading_examples(
     device: torch.device,
     report: Callable[[str], None],
 ) -> HeadingExamples:
-    """Look at episodes, or at those that are missing; a finished folder of the same settings is taken as it is.
+    """Compute the examples that are missing in a folder, and read all.
 
     Args:
-        folder: made where missing.
-        source: gives the episodes.
-        config: what the source was made of; of it, "episodes" says how many to look at, "min_points" is that of
+        folder: created if missing.
+        source: of the episodes.
+        config: settings of the source; "episodes" is the number of episodes, "min_points" the argument of
             `examples_in`.
         detector: in evaluation mode.
-        processes: how many look at episodes side by side.
-        autocast: the precision that the detector looks in.
-        device: where it looks.
-        report: takes lines of progress.
+        processes: number of processes.
+        autocast: context of the detector's precision.
+        device: of the detector.
+        report: is called with each line of progress.
 
     Raises:
-        ValueError: the folder was made with other settings or another detector; nothing was found.
+        ValueError: the folder was written with other settings or another detector; no object was detected.
     """
     episodes = config["episodes"]
 
@@ -121,7 +121,7 @@ def _write(
     min_points: int,
     episode: int,
 ) -> list[str]:
-    detector.to(device)  # here: another process cannot be sent what lies on a GPU
+    detector.to(device)  # here, because GPU tensors are not sent to processes
     with autocast:
         examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
     if not examples:

@@ -1,4 +1,4 @@
-"""The data loader of all trainings: worker processes send batches through pipes, not through `/dev/shm`."""
+"""Data loader: worker processes send batches through pipes instead of shared memory (`/dev/shm`)."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ def batches(
     prefetch: int = 2,
     pin_memory: bool = False,
 ) -> Iterator[Any]:
-    """Batches of samples, in order.
+    """Iterate over batches of samples, in order.
 
-    torch's own way between processes is shared memory, of which containers have 64 MB by default; there a batch is lost
-    with a message from a thread. So a batch is pickled in the worker.
+    By default, torch transfers tensors between processes in shared memory. Containers have 64 MB of it by default, and
+    a batch that does not fit is lost. Therefore batches are pickled in the worker.
 
     Args:
         samples: a torch data set, iterable or with `__getitem__`.
-        batch_size: samples in a batch.
-        workers: processes that make batches; 0 makes them in this one.
+        batch_size: number of samples in a batch.
+        workers: number of worker processes; 0 loads in this process.
         collate: makes a batch of a list of samples; picklable.
-        prefetch: batches that each worker makes in advance.
+        prefetch: number of batches that each worker prepares in advance.
         pin_memory: call `pin_memory` of each batch, for transfer to a GPU.
     """
     loader = DataLoader(
@@ -40,7 +40,7 @@ def batches(
         num_workers=workers,
         collate_fn=partial(_pickled, collate) if workers else collate,
         prefetch_factor=prefetch if workers else None,
-        generator=torch.Generator(),  # the loader draws a seed; not from the caller's generator
+        generator=torch.Generator(),  # the loader draws a seed from it instead of torch's global one
     )
     for sent in loader:
         batch = pickle.loads(sent) if workers else sent

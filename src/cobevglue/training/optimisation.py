@@ -1,4 +1,4 @@
-"""How weights are found: the optimiser's settings and precision, the learning rate over the steps, one step."""
+"""Optimisation: AdamW, learning rate schedule, precision, exponential moving average of the weights."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 
 class OptimisationConfig(Settings):
-    """How weights are found: AdamW, one cycle of the learning rate over all steps.
+    """Settings of the optimisation: AdamW with one cycle of the learning rate over all steps.
 
     Attributes:
-        epochs: how many.
+        epochs: number of epochs.
         samples_per_epoch: of all processes together, rounded down to full batches.
-        batch_size: samples in a step, of each process.
-        learning_rate: the highest.
-        start: share of it at the first step ...
-        warm_up: ... growing to the highest over this share of all steps ...
-        end: ... and falling to this share of it until the last step; both as half a cosine.
-        weight_decay: of the weights with more than one dimension: not of biases and norms.
-        clip: largest norm of the gradient; a longer one is shortened.
-        mean_decay: the model that is validated and saved is a running mean of the weights that forgets them by this
-            factor a step (faster in the first steps); 0 takes the last weights.
-        precision: of convolutions and products; weights, norms and the loss are float32 always. "auto" is bfloat16 on
-            CUDA and float32 elsewhere. On a CPU that has AVX512-BF16 or AMX, "bfloat16" takes half the time.
+        batch_size: number of samples per step and process.
+        learning_rate: maximum learning rate.
+        start: learning rate of the first step, relative to the maximum.
+        warm_up: share of all steps in which the learning rate increases to the maximum, as half a cosine.
+        end: learning rate of the last step, relative to the maximum; it decreases as half a cosine.
+        weight_decay: of weights with more than one dimension, not of biases and normalisation.
+        clip: maximum norm of the gradient.
+        mean_decay: decay per step of the exponential moving average of the weights, which is validated and saved
+            (smaller in the first steps); 0 uses the current weights.
+        precision: of convolutions and matrix products; weights, normalisation and loss are always float32. "auto" is
+            bfloat16 on CUDA and float32 elsewhere. On CPUs with AVX512-BF16 or AMX, "bfloat16" halves the time.
     """
 
     epochs: Annotated[int, Field(ge=1)] = 30
@@ -53,10 +53,10 @@ class OptimisationConfig(Settings):
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
     def steps_per_epoch(self, processes: int = 1) -> int:
-        """Full batches in an epoch, of each of so many processes.
+        """Number of full batches per epoch and process.
 
         Raises:
-            ValueError: not even one.
+            ValueError: less than one.
         """
         steps = self.samples_per_epoch // (self.batch_size * processes)
         if not steps:
@@ -68,13 +68,13 @@ class OptimisationConfig(Settings):
 
 
 def autocast(config: OptimisationConfig, device: torch.device) -> torch.autocast:
-    """The context for the forward pass in the precision that `config` asks for."""
+    """Context of the forward pass in the precision of `config`."""
     wanted = config.precision == "bfloat16" or (config.precision == "auto" and device.type == "cuda")
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
 
 
 def learning_rate(step: int, steps: int, config: OptimisationConfig) -> float:
-    """Of step `step` of `steps`: a function of nothing else, so that a resumed run needs no memory of it."""
+    """Learning rate of step `step` (from 0) of `steps`: a function without state, so nothing is stored for resuming."""
     rising = config.warm_up * steps
     if step < rising:
         return config.learning_rate * _half_cosine(config.start, 1.0, step / rising)
@@ -86,7 +86,7 @@ def _half_cosine(first: float, last: float, share: float) -> float:
 
 
 def make_optimizer(model: nn.Module, config: OptimisationConfig) -> torch.optim.AdamW:
-    """AdamW over the parameters, weight decay on those it is meant for."""
+    """AdamW over the trainable parameters, with weight decay for those of more than one dimension."""
     parameters = [p for p in model.parameters() if p.requires_grad]
     groups = [
         {"params": [p for p in parameters if p.ndim > 1], "weight_decay": config.weight_decay},
@@ -96,21 +96,21 @@ def make_optimizer(model: nn.Module, config: OptimisationConfig) -> torch.optim.
 
 
 class MeanWeights(Generic[Model]):
-    """A copy of a model whose weights follow it as an exponential running mean; norms' statistics, too.
+    """Exponential moving average of the weights and the normalisation statistics of a model.
 
     Attributes:
-        model: the copy, in evaluation mode.
+        model: the averaged model, in evaluation mode.
     """
 
     def __init__(self, model: Model, decay: float) -> None:
-        """Start from the weights as they are."""
+        """Start from the current weights."""
         self.model = copy.deepcopy(model)
         self.model.eval().requires_grad_(False)
         self._decay = decay
 
     @torch.no_grad()
     def update(self, model: nn.Module, step: int) -> None:
-        """Take in the weights after step `step` (from 0)."""
+        """Update the average with the weights after step `step` (from 0)."""
         decay = min(self._decay, (1.0 + step) / (10.0 + step))
         ours, theirs = self.model.state_dict(), model.state_dict()
         floating = [name for name, value in ours.items() if value.is_floating_point()]
@@ -120,21 +120,21 @@ class MeanWeights(Generic[Model]):
 
 
 class Learner(Generic[Model]):
-    """A model, the running mean of its weights, and its optimiser.
+    """A model, the moving average of its weights, and its optimiser.
 
     Attributes:
-        model: what is trained.
-        mean: what is validated and saved.
-        config: how.
+        model: the model in training.
+        mean: the averaged model, for validation and saving.
+        config: settings.
     """
 
     def __init__(self, model: Model, config: OptimisationConfig, state: RunState | None = None) -> None:
-        """Start from the model as it is, or from where a run was left.
+        """Start from the current weights, or from a saved state.
 
         Args:
-            model: what to train.
-            config: how.
-            state: of the run to go on with.
+            model: to train.
+            config: settings.
+            state: of the run to resume; loaded into the model, too.
         """
         self.model, self.config = model, config
         if state is not None:
@@ -147,10 +147,10 @@ class Learner(Generic[Model]):
             self._optimizer.load_state_dict(state.optimizer)
 
     def learn(self, loss: Tensor, step: int, steps: int) -> tuple[float, Tensor]:
-        """Step `step` (from 0) of `steps`, down the gradient of a loss.
+        """Perform optimisation step `step` (from 0) of `steps`.
 
         Returns:
-            The learning rate, and the length of the gradient before it was clipped.
+            The learning rate, and the norm of the gradient before clipping.
         """
         rate = learning_rate(step, steps, self.config)
         for group in self._optimizer.param_groups:
@@ -165,7 +165,7 @@ class Learner(Generic[Model]):
     def state(
         self, config: Settings, epoch: int, elapsed: float, processes: int = 1, best: float | None = None
     ) -> RunState:
-        """What is needed to go on later; see `RunState`."""
+        """The state for resuming; see `RunState`."""
         return RunState(
             config=config.model_dump(mode="json"),
             processes=processes,

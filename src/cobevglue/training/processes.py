@@ -1,4 +1,4 @@
-"""One or many processes: `torchrun` starts many; without it there is one, and nothing here does anything."""
+"""Distributed training with `torchrun`; without it, there is one process and no communication."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["Processes", "process_group"]
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among all.
+    """This process in the process group.
 
     Attributes:
-        device: what this process computes on.
-        rank: its number, from 0.
-        count: how many there are.
+        device: of this process.
+        rank: index of this process, from 0.
+        count: number of processes.
     """
 
     device: torch.device
@@ -32,11 +32,11 @@ class Processes:
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the process that writes and reports."""
+        """Whether this process writes files and reports progress."""
         return self.rank == 0
 
     def gather(self, value: Any) -> list[Any]:
-        """`value` of every process in the order of ranks, in the first process; an empty list in the others."""
+        """Values of all processes by rank in the first process; an empty list in the others."""
         if self.count == 1:
             return [value]
         values = [None] * self.count if self.is_first else None
@@ -44,7 +44,7 @@ class Processes:
         return values or []
 
     def share(self, value: Any) -> Any:
-        """`value` of the first process."""
+        """Broadcast `value` of the first process to all."""
         if self.count == 1:
             return value
         values = [value]
@@ -54,13 +54,13 @@ class Processes:
 
 @contextmanager
 def process_group(device: str) -> Iterator[Processes]:
-    """Join the processes that `torchrun` started, if it did.
+    """Initialise the process group if `torchrun` started this process, and destroy it at the end.
 
     Args:
-        device: "auto" (CUDA where there is one), or torch's name of a device.
+        device: "auto" (CUDA if available), or torch's name of a device.
 
     Raises:
-        ValueError: there is no such device.
+        ValueError: the device is not available.
     """
     chosen = chosen_device(device)
     count = int(os.environ.get("WORLD_SIZE", "1"))
@@ -70,7 +70,7 @@ def process_group(device: str) -> Iterator[Processes]:
         return
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
-    # Gloo (torch 2.13) otherwise connects all processes at once, and now and then hangs in that.
+    # By default, Gloo (torch 2.13) connects all processes at once, and sometimes hangs there.
     os.environ.setdefault("TORCH_GLOO_LAZY_INIT", "1")
     dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:

@@ -1,4 +1,4 @@
-"""What a training says of its steps, and when it gives up."""
+"""Progress of an epoch: means of loss terms, speed, remaining time; detects divergence."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["DivergedError", "EpochProgress"]
 
 
 class DivergedError(RuntimeError):
-    """The loss is no number any more."""
+    """The loss is not finite."""
 
 
 class EpochProgress:
-    """The steps of one epoch: their means are logged and reported every so often, and those of the epoch at its end."""
+    """Logs and reports means over steps, periodically and at the end of the epoch."""
 
     def __init__(
         self,
@@ -33,16 +33,16 @@ class EpochProgress:
         processes: int = 1,
         name: str = "",
     ) -> None:
-        """Nothing done yet.
+        """Start an epoch.
 
         Args:
-            optimisation: says how many steps there are.
-            epoch: from 0.
-            log: takes numbers: "train" every so often, "epoch" at the end.
-            report: takes lines.
-            every: time between lines [s].
-            processes: that train together.
-            name: of what is trained, where it needs saying.
+            optimisation: settings, for the number of steps.
+            epoch: index from 0.
+            log: of the run; group "train" every `every` seconds, group "epoch" at the end.
+            report: is called with each line of progress.
+            every: time between reports [s].
+            processes: number of processes that train together.
+            name: prefix of the reported lines.
         """
         self._optimisation, self._log, self._report, self._every = optimisation, log, report, every
         self._batch = optimisation.batch_size * processes
@@ -53,24 +53,24 @@ class EpochProgress:
 
     @property
     def steps(self) -> range:
-        """Of this epoch, counted from the first epoch's first as 0."""
+        """Indices of the steps of this epoch, counted over all epochs from 0."""
         return range(self._epoch * self._per_epoch, (self._epoch + 1) * self._per_epoch)
 
     @property
     def all_steps(self) -> int:
-        """Of all epochs."""
+        """Number of steps of all epochs."""
         return self._optimisation.epochs * self._per_epoch
 
     def add(self, values: Mapping[str, Tensor], rate: float, waited: float = 0.0) -> None:
-        """Note a step that is done.
+        """Add a completed step.
 
         Args:
-            values: of the step; "total" is the loss.
+            values: scalars of the step; "total" is the loss.
             rate: the learning rate.
-            waited: for its samples [s].
+            waited: time spent waiting for samples [s].
 
         Raises:
-            DivergedError: the loss is not finite any more; seen when there is something to report.
+            DivergedError: the mean loss is not finite; checked only when it is reported.
         """
         self._step += 1
         detached = {name: value.detach() for name, value in values.items()}
@@ -101,7 +101,7 @@ class EpochProgress:
 
 @dataclass
 class _Meter:
-    """Means over steps. Sums stay on the device: asking a GPU for a number makes it wait."""
+    """Means over steps. The sums stay on the device: reading a value synchronises with the GPU."""
 
     started: float = field(default_factory=time.monotonic)
     sums: dict[str, Tensor] = field(default_factory=dict)
@@ -110,24 +110,24 @@ class _Meter:
     waited: float = 0.0
 
     def add(self, values: Mapping[str, Tensor], samples: int, waited: float) -> None:
-        """The values of a step, its samples, and the time it waited for them [s]."""
+        """Add the values of a step, its number of samples, and the time spent waiting for them [s]."""
         for name, value in values.items():
             self.sums[name] = self.sums[name] + value if name in self.sums else value
         self.steps, self.samples, self.waited = self.steps + 1, self.samples + samples, self.waited + waited
 
     @property
     def seconds(self) -> float:
-        """Since the first."""
+        """Time since the start [s]."""
         return time.monotonic() - self.started
 
     def means(self) -> dict[str, float]:
-        """Of the values, with "samples_per_second" and the share of time spent "waiting"."""
+        """Means of the values, "samples_per_second", and the share of time spent "waiting" for samples."""
         seconds = max(self.seconds, 1e-9)
         terms = {name: float(value) / self.steps for name, value in self.sums.items()}
         return {**terms, "samples_per_second": self.samples / seconds, "waiting": self.waited / seconds}
 
 
 def _duration(seconds: float) -> str:
-    """In words: "5 min", "1 h 20 min"."""
+    """Format a duration: "5 min", "1 h 20 min"."""
     minutes = round(seconds / 60.0)
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"

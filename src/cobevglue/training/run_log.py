@@ -1,4 +1,4 @@
-"""What a run says about itself: lines for people, `log.jsonl` for programs, event files for TensorBoard."""
+"""Log of a run: progress messages, `log.jsonl`, and event files of TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["RunLog", "print_progress"]
 
 
 def print_progress(text: str) -> None:
-    """A line to standard error."""
+    """Print a line to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 class RunLog:
-    """Files of one run, added to when it is resumed. Without TensorBoard there is `log.jsonl` alone."""
+    """Log files of one run, appended to when it is resumed. Without TensorBoard, only `log.jsonl` is written."""
 
     def __init__(self, folder: Path, from_step: int = 0, write: bool = True) -> None:
         """Open the files.
 
         Args:
             folder: of the run.
-            from_step: where a resumed run goes on: what an earlier try logged beyond is forgotten. 0 starts anew.
-            write: False for a log of nothing: one process writes for all.
+            from_step: step at which a run is resumed; later entries are removed. 0 removes all entries.
+            write: False disables the log, in all but the first process.
         """
         self._lines: TextIO | None = None
         self._events: Any = None
@@ -56,7 +56,7 @@ class RunLog:
             self._events.close()
 
     def add(self, group: str, step: int, epoch: int, values: Mapping[str, float]) -> None:
-        """Log numbers after `step` steps: a line in `log.jsonl`, a curve "group/name" each in TensorBoard."""
+        """Log values after `step` steps: one line in `log.jsonl`, and "group/name" in TensorBoard."""
         if self._lines is None:
             return
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
@@ -69,6 +69,6 @@ class RunLog:
 
 
 def _complete_lines(path: Path) -> list[str]:
-    """Those of an earlier try; one that was cut off while writing is left out."""
+    """Lines of an existing log, without one that was written incompletely."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
     return [line for line in lines if line.endswith("}\n")]

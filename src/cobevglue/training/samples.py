@@ -1,4 +1,4 @@
-"""Where clouds to train on come from."""
+"""Sources of training samples: episodes of labelled clouds."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ __all__ = ["DatasetEpisodes", "EpisodeSource"]
 
 
 class EpisodeSource(Protocol):
-    """Where samples come from. It is copied into worker processes, so it must be picklable."""
+    """Source of samples. It must be picklable, because it is copied to worker processes."""
 
     def episode(self, index: int) -> Sequence[LabelledCloud]:
-        """A few samples that are cheap to make together: snapshots of one simulated world, some frames of a data set.
+        """The samples of an episode: snapshots of one simulated world, or some frames of a data set.
 
         Args:
-            index: any number from 0; a finite source starts over, in another order.
+            index: from 0, without an upper limit; a finite source starts over in a different order.
 
         Returns:
-            The samples; the same for the same source settings (its seed among them) and index, in any process.
+            The samples. They depend only on the settings of the source, its seed included, and on `index`.
         """
         ...
 
 
 class DatasetEpisodes:
-    """Episodes of a data set: some of its frames drawn at random, each with all agents that have a cloud.
+    """Episodes of a data set: random frames, each with all agents that have a cloud.
 
-    Frames are in a new order in every pass over the data set, so that an episode's samples have little in common.
+    Frames are shuffled anew in every pass over the data set, so samples of an episode are little correlated.
     """
 
     def __init__(self, dataset: Dataset, seed: int = 0, frames_per_episode: int = 8) -> None:
-        """Look at which frames there are; no cloud is read.
+        """List the frames, without reading clouds.
 
         Args:
             dataset: a split of a data set.
             seed: of the order of frames.
-            frames_per_episode: frames that make an episode.
+            frames_per_episode: number of frames in an episode.
 
         Raises:
-            ValueError: there are no frames.
+            ValueError: the data set has no frames.
         """
         self._dataset, self._seed = dataset, seed
         self._frames = [(scenario.name, number) for scenario in dataset for number in range(len(scenario))]
@@ -56,14 +56,14 @@ class DatasetEpisodes:
         self._pass: tuple[int, IntArray] = (-1, np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
-        """Episodes of one pass over the data set; a last incomplete one is left out."""
+        """Number of episodes in one pass over the data set; an incomplete last one is omitted."""
         return len(self._frames) // self._frames_per_episode
 
     def episode(self, index: int) -> Sequence[LabelledCloud]:
         """The samples of episode `index`; see `EpisodeSource`.
 
         Raises:
-            ValueError: a broken file; names it.
+            ValueError: a damaged file; the message names it.
         """
         number, position = divmod(index, len(self))
         if self._pass[0] != number:

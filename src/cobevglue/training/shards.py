@@ -1,4 +1,4 @@
-"""What is computed once before a training and kept on disk: in pieces, so that it can be interrupted and shared out."""
+"""Precomputed training data on disk, in shards: the computation can be interrupted and distributed over processes."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def write_shards(
     processes: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Make shards, or those that are missing; a finished folder of the same settings is left as it is.
+    """Compute the shards that are missing in a folder.
 
     Args:
-        folder: made where missing.
-        settings: all that the content depends on, as JSON can hold it; kept in `index.json`.
-        count: of shards.
-        write: makes one and returns the names of its files in `folder`; picklable.
-        processes: how many shards are made side by side, with one thread each.
-        progress: is told after each shard how many are done, and how many files there are.
+        folder: created if missing.
+        settings: all settings that the content depends on, JSON-serialisable; stored in `index.json`.
+        count: number of shards.
+        write: writes one shard, given its index, and returns the names of its files in `folder`; picklable.
+        processes: number of processes; if several, each uses one thread.
+        progress: is called after each shard with the number of completed shards and of their files.
 
     Raises:
-        ValueError: the folder was made with other settings.
+        ValueError: the folder was written with other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
     started = folder / _SETTINGS
@@ -58,10 +58,10 @@ def write_shards(
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """The settings of a finished folder, and under "files" the names of its files.
+    """The settings of a completed folder, and the names of its files under the key "files".
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: the folder is missing or incomplete.
     """
     index = folder / _INDEX
     if not index.is_file():
@@ -72,11 +72,11 @@ def read_index(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _map(processes: int) -> Iterator[Callable[[Callable[[int], list[str]], range], Iterable[list[str]]]]:
-    """`map`, in this process or in several."""
+    """`map` in this process or in several."""
     if processes == 1:
         yield map
     else:
-        fresh = get_context("spawn")  # a forked process inherits torch's threads in whatever state they are
+        fresh = get_context("spawn")  # forking while torch has threads can deadlock
         with ProcessPoolExecutor(processes, fresh, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             yield pool.map
 

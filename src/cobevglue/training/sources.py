@@ -1,4 +1,4 @@
-"""The source of samples that a configuration names."""
+"""Source of samples of a configuration."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ __all__ = ["Repeated", "make_source"]
 
 @dataclass(frozen=True)
 class Repeated:
-    """The first episodes of a source, over and over."""
+    """Repeats the first episodes of a source."""
 
     source: EpisodeSource
     episodes: int
 
     def episode(self, index: int) -> Sequence[LabelledCloud]:
-        """Episode `index`, counted in a circle; see `EpisodeSource`."""
+        """Episode `index` modulo `episodes`; see `EpisodeSource`."""
         return self.source.episode(index % self.episodes)
 
 
 def make_source(config: DataConfig, seed: int, *, validation: bool) -> EpisodeSource:
-    """What to train or validate on.
+    """Open the source of training or validation samples.
 
     Args:
-        config: names it.
-        seed: of the run. Validation has one of its own, so that runs can be compared.
-        validation: take the validation split.
+        config: settings of the source.
+        seed: of the run. Validation always uses seed 0, so that runs can be compared.
+        validation: use the validation split.
 
     Raises:
-        ValueError: no root, no such split, or options of a reader for simulated data.
-        FileNotFoundError: the data set is not there.
+        ValueError: no root, unknown split, or options of a reader for simulated data.
+        FileNotFoundError: the data set does not exist.
     """
     split = config.split_name(validation=validation)
     seed = 0 if validation else seed

@@ -1,4 +1,4 @@
-"""The endless row of training samples, cut into epochs and shared out among processes and their workers."""
+"""Streams of training and validation samples, distributed over processes and their workers."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ __all__ = ["EpisodeStream", "FixedStream"]
 Item = TypeVar("Item")
 
 _STREAM = 0x7A11
-"""Keeps these random numbers apart from others that are drawn with the same seed."""
+"""Separates these random numbers from others of the same seed."""
 _MAX_EMPTY = 100
-"""So many episodes without a sample in a row are taken for a broken source."""
+"""Maximum number of consecutive episodes without samples."""
 
 
 class EpisodeStream(IterableDataset[Item], Generic[Item]):
-    """Samples of all epochs to come, one after the other, for one process.
+    """Training samples of several epochs for one process.
 
-    Which samples an epoch has, in what order and how changed, depends on nothing but the seed, the epoch and the
-    number of processes and workers: a run that is resumed at an epoch sees what the uninterrupted one would have.
+    The samples of an epoch, their order and their augmentation depend only on the seed, the epoch and the numbers of
+    processes and workers. A resumed run therefore gets the same samples as an uninterrupted one.
 
-    A worker holds the samples of a few episodes and draws from them at random, since the samples of one episode look
-    alike. While the process validates, its workers are already busy with the next epoch.
+    Samples of one episode are similar, so a worker draws at random from the samples of several episodes. Workers
+    continue with the next epoch while the process validates.
     """
 
     def __init__(
@@ -45,19 +45,19 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
         rank: int = 0,
         processes: int = 1,
     ) -> None:
-        """Nothing is made before the first sample is asked for.
+        """Store the settings; no sample is computed before iteration.
 
         Args:
-            source: gives the episodes.
-            prepare: makes an item of a sample: augmentation, targets.
-            epochs: which ones, in steps of 1.
+            source: of the episodes.
+            prepare: preprocesses a sample: augmentation, targets.
+            epochs: indices of the epochs, in steps of 1.
             batches_per_epoch: of this process.
-            batch_size: items in a batch; the data loader must use the same, and workers take turns batch by batch.
+            batch_size: items in a batch; the data loader must use the same, with workers alternating by batch.
             seed: of order and augmentation.
-            pool: episodes that are shuffled together.
-            uses: how often each sample is prepared.
-            rank: number of this process ...
-            processes: ... of so many.
+            pool: number of episodes that are shuffled together.
+            uses: number of times that each sample is used.
+            rank: index of this process.
+            processes: number of processes.
         """
         self._source, self._prepare = source, prepare
         self._epochs, self._batches_per_epoch, self._batch_size = epochs, batches_per_epoch, batch_size
@@ -67,7 +67,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
     def __iter__(self) -> Iterator[Item]:
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info is not None else (0, 1)
-        # The loader asks worker 0 first, wherever the run starts; in an uninterrupted run it might be another's turn.
+        # The loader always starts with worker 0; in an uninterrupted run, another worker might make this batch.
         worker = (worker + self._epochs.start * self._batches_per_epoch) % workers
         for epoch in self._epochs:
             first = epoch * self._batches_per_epoch
@@ -89,8 +89,8 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
             yield self._prepare(pool.pop(), random)
 
     def _episodes(self, epoch: int, worker: int, workers: int) -> Iterator[list[LabelledCloud]]:
-        """The episodes of one worker in one epoch: no other has the same, and other epochs have others."""
-        # An epoch uses at most one episode for each of its samples, so this leaves room for all.
+        """The episodes of one worker in one epoch, disjoint from those of other workers, processes and epochs."""
+        # An epoch uses at most one episode per sample, so the indices of epochs do not overlap.
         index = epoch * self._batches_per_epoch * self._batch_size * self._processes
         index += self._rank * workers + worker
         empty = 0
@@ -104,7 +104,7 @@ class EpisodeStream(IterableDataset[Item], Generic[Item]):
 
 
 class FixedStream(IterableDataset[Item], Generic[Item]):
-    """The samples of some episodes in order, unchanged: for validation."""
+    """The samples of some episodes in fixed order, for validation."""
 
     def __init__(
         self,
@@ -112,12 +112,12 @@ class FixedStream(IterableDataset[Item], Generic[Item]):
         prepare: Callable[[LabelledCloud, np.random.Generator], Item],
         episodes: range,
     ) -> None:
-        """Nothing is made before the first sample is asked for.
+        """Store the settings; no sample is computed before iteration.
 
         Args:
-            source: gives the episodes.
-            prepare: makes an item of a sample.
-            episodes: which ones; workers take turns.
+            source: of the episodes.
+            prepare: preprocesses a sample.
+            episodes: indices of the episodes; distributed over the workers.
         """
         self._source, self._prepare, self._episodes = source, prepare, episodes
 

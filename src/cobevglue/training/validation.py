@@ -1,4 +1,4 @@
-"""How good a detector is on episodes that do not change: loss and average precision."""
+"""Validation of a detector during training: loss and average precision on fixed episodes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Validation"]
 
 
 class Validation:
-    """The validation episodes of a run; made at the first use, and kept. Processes share them out."""
+    """Validation episodes of a run, distributed over processes; computed at the first use and cached."""
 
     def __init__(
         self, config: TrainDetectorConfig, source: EpisodeSource, processes: Processes, loss: DetectionLoss
@@ -27,9 +27,9 @@ class Validation:
         self._batches: list[Batch] | None = None
 
     def measure(self, model: PointPillars) -> dict[str, float]:
-        """Mean loss terms, "ap_0.5" and "ap_0.7" of a model in evaluation mode, in the first process; {} in others.
+        """Mean loss terms, "ap_0.5" and "ap_0.7" of a model in evaluation mode; {} in all but the first process.
 
-        AP ignores objects with fewer points than a target needs; it is NaN where there is nothing to find.
+        AP ignores objects with fewer than `data.min_points` points; it is NaN without evaluated objects.
         """
         if self._batches is None:
             self._batches = self._make_batches()
