@@ -47,14 +47,14 @@ def test_an_example_is_a_vehicle_that_was_found() -> None:
     examples = examples_in(cloud, detector, min_points=2)
     detector.detection = detector.detection.model_copy(update={"heading_refinement": False})
     boxes = detector.detect(cloud.points)
-    assert 0 < len(examples.right) <= len(boxes)
-    for vehicle, right, number in zip(examples.looks.vehicle, examples.right, examples.looks.number, strict=True):
+    assert 0 < len(examples.correct) <= len(boxes)
+    for vehicle, correct, number in zip(examples.inputs.vehicle, examples.correct, examples.inputs.number, strict=True):
         nearest = np.hypot(*(cloud.boxes.center[:, :2] - vehicle[:2].numpy()).T).argmin()
-        assert (np.cos(cloud.boxes.yaw[nearest] - float(vehicle[6])) > 0) == bool(right)
+        assert (np.cos(cloud.boxes.yaw[nearest] - float(vehicle[6])) > 0) == bool(correct)
         assert cloud.point_count[nearest] >= 2
         assert number >= 1
     everything = examples_in(cloud, detector, min_points=10_000_000)
-    assert len(everything.right) == 0
+    assert len(everything.correct) == 0
 
 
 def test_training_changes_the_heading_refiner_alone(examples: Path, tmp_path: Path) -> None:
@@ -145,15 +145,15 @@ def test_augmentation_drops_and_jitters_within_limits() -> None:
     number = torch.linspace(10, 100, k).long()
     points = torch.where(torch.arange(64)[None, :, None] < number[:, None, None], torch.tensor([1.0, 2.0, 3.0]), 0.0)
     vehicle, around = torch.full((k, 9), 0.5), torch.full((k, 8, 6), 0.5)
-    looks = HeadingInputs(points, number, vehicle, around)
+    inputs = HeadingInputs(points, number, vehicle, around)
     random = torch.Generator().manual_seed(0)
 
     nothing = HeadingAugmentation(thinning=0.0, jitter=0.0, stretch=0.0, alone=0.0, unsure=0.0)
-    for before, after in zip(looks, augmented(looks, nothing, random), strict=True):
+    for before, after in zip(inputs, augmented(inputs, nothing, random), strict=True):
         assert torch.equal(before, after)
 
     some = HeadingAugmentation(thinning=0.5, jitter=0.01, stretch=0.1, alone=0.25, unsure=0.25)
-    other = augmented(looks, some, random)
+    other = augmented(inputs, some, random)
     share = other.number / number
     assert share.min() >= 0.5
     assert share.max() <= 1.1

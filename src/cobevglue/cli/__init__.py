@@ -1,4 +1,4 @@
-"""The command line: `cobevglue --help`. A thin layer over the API; what a command needs is imported when it runs."""
+"""Command line `cobevglue`, a thin layer over the API. Each command imports its dependencies when it runs."""
 
 from cobevglue.cli.app import app, main
 

@@ -1,4 +1,4 @@
-"""`cobevglue align`: the relative pose between two object lists, or between two recordings of them."""
+"""`cobevglue align`: relative pose from two object lists, or from two sequences of object lists."""
 
 from __future__ import annotations
 
@@ -25,20 +25,22 @@ def align(
         Path, typer.Argument(metavar="EGO", help="Object list of the agent in whose frame the result is, or a folder.")
     ],
     other: Annotated[Path, typer.Argument(metavar="OTHER", help="Object list of the other agent, or a folder.")],
-    paper: Annotated[bool, typer.Option("--paper", help="The paper's settings instead of the robust ones.")] = False,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Use the paper's settings instead of the robust ones.")
+    ] = False,
     picture: Annotated[
         Path | None, typer.Option(help="Draw both object graphs and the result.", metavar="FILE.png")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Find the relative pose between two agents from the objects that both see.
+    """Estimate the relative pose between two agents from commonly observed objects.
 
     EGO and OTHER are object lists, each in its own agent's frame: JSON files (metres and radians, {"boxes": [{"x",
-    "y", "l", "w", "yaw", and if known "z", "h", "score", "track_id", "label"}]}) or frames of OPV2V (.yaml), whose
-    `vehicles` are moved to the agent's own LiDAR frame first; `lidar_pose` plays no other part.
+    "y", "l", "w", "yaw", optional "z", "h", "score", "track_id", "label"}]}) or frames of OPV2V (.yaml), whose
+    `vehicles` are transformed to the agent's own LiDAR frame; `lidar_pose` is used for nothing else.
 
-    Two folders are recordings at 10 Hz: frames are paired by name, and what was found is remembered from frame to
-    frame. The verdict is that of the last frame.
+    Two folders are sequences at 10 Hz: frames are paired by file name, and the state of the aligner is kept from frame
+    to frame. The exit code is that of the last frame.
 
     Exit code: 0 the pose was accepted, 3 it was refused, 2 bad input.
     """
@@ -79,7 +81,7 @@ def _glue(paper: bool) -> BEVGlue:
 
 
 def _document(alignment: Alignment) -> dict[str, Any]:
-    """An alignment for JSON: metres and radians, degrees where the name says so."""
+    """JSON document of an alignment: metres and radians; degrees where the key ends in `_deg`."""
     pose = alignment.ego_SE2_other
     return {
         "accepted": bool(alignment.accepted),
@@ -125,7 +127,7 @@ def _print_frames(pairs: list[FramePair], alignments: list[Alignment]) -> None:
 
 
 def _check_picture(path: Path) -> None:
-    """Refuse a name that cannot be written as a picture before anything is computed."""
+    """Check the file name of the picture before the computation starts."""
     from cobevglue.visualization.style import check_picture_name
 
     check_picture_name(path)

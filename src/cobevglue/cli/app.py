@@ -1,4 +1,4 @@
-"""The program `cobevglue`: its commands, its exit codes, and one line on standard error for what goes wrong."""
+"""The program `cobevglue`: commands, exit codes, and errors as one line on standard error."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from cobevglue.cli.train import train
 __all__ = ["BAD_INPUT", "INTERRUPTED", "REFUSED", "app", "main"]
 
 BAD_INPUT, REFUSED, INTERRUPTED = 2, 3, 130
-"""Exit codes; 0 is for what is done."""
+"""Exit codes; 0 means done."""
 
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
-"""What typer raises for an unknown command or option; it has no public name of its own in all versions."""
+"""The exception that typer raises for unknown commands and options; not public in all versions of typer."""
 
 app = typer.Typer(
     name="cobevglue",
-    help="Relative pose between vehicles and roadside units from the objects that both see, without trusting GPS.",
+    help="Relative pose between vehicles and roadside units from commonly observed objects, without trusting GPS.",
     epilog="Exit codes: 0 done, 2 bad input or usage, 3 the alignment was refused.",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -40,7 +40,7 @@ app = typer.Typer(
 
 
 def _reflowed(text: str) -> str:
-    """A docstring whose paragraphs are one line each, so that the help breaks lines where the terminal ends."""
+    """Join the lines of each paragraph, so that the help is wrapped at the width of the terminal."""
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n"))
 
 
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program.
 
     Args:
-        arguments: the words after `cobevglue`; those of the command line where left out.
+        arguments: of the program, without its name; None for those of the command line.
 
     Returns:
         The exit code: 0 done, 2 bad input or usage, 3 the alignment was refused, 130 interrupted.
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _usage_message(error: Exception) -> str:
-    """One line: what is wrong, and where help is."""
+    """One line: the error, and the command that prints help."""
     message = " ".join(str(getattr(error, "format_message", error.__str__)()).split())
     if re.search(r"No such option: -\d", message):  # roadside units of data sets have negative ids
         message = f"{message.rstrip('.')}; write a path that begins with a dash as ./-1/…"

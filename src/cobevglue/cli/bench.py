@@ -1,4 +1,4 @@
-"""`cobevglue bench`: how fast each step is on this machine, and how long messages are."""
+"""`cobevglue bench`: run time of each step on this machine, and size of messages."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ __all__ = ["bench"]
 
 
 def bench(
-    weights: Annotated[str, typer.Option(help="Of the detector: a shipped name, or a .safetensors file.")] = "compact",
-    threads: Annotated[int, typer.Option(min=1, help="Of the detector's network.")] = 2,
+    weights: Annotated[
+        str, typer.Option(help="Weights of the detector: a shipped name, or a .safetensors file.")
+    ] = "compact",
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the detector's network.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Measure the speed of each step, and the size of messages, over object counts.
+    """Measure the run time of each step, and the size of messages, for several numbers of objects.
 
-    Best and median of repeated frames of two agents that share 60 % of their objects; compilation is not counted. A
-    first frame is searched without knowing anything; later frames use what was found before. Perception, from a stored
-    cloud to tracked boxes, is measured where torch and the simulation are installed, on CUDA if there is one.
+    Minimum and median over frames of two agents that share 60 % of their objects, without compilation. Alignment is
+    measured for first frames, without state, and for later frames. Perception, from a stored cloud to tracked boxes, is
+    measured if torch and the simulation are installed, on CUDA if available.
     """
     print_note("the first run compiles for some seconds …")
     from cobevglue.cli.measure import OBJECT_COUNTS, STEPS, measure
@@ -46,13 +48,13 @@ def bench(
     sizes = ("message", *(str(report["message_bytes"][str(count)]) for count in OBJECT_COUNTS))
     print_table("Size", ("bytes", *header[1:]), [sizes])
     if perception is None:
-        print_note("perception is left out: pip install 'cobevglue[perception,simulation]'")
+        print_note("perception was not measured; it needs: pip install 'cobevglue[perception,simulation]'")
     else:
         stages = [(name, f"{t['median_ms']:.1f}", f"{t['best_ms']:.1f}") for name, t in perception["stages"].items()]
         title = "One cloud of {points} points, weights {weights}, {device}, {threads} threads".format(**perception)
         print_table(title, ("stage, milliseconds", "median", "best"), stages)
         if perception["largest_memory_mb"] is not None:
-            print(f"largest memory of the process up to here: {perception['largest_memory_mb']:.0f} MB")
+            print(f"peak memory of the process: {perception['largest_memory_mb']:.0f} MB")
     machine = report["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     print(f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; {versions}")

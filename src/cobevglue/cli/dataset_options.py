@@ -1,4 +1,4 @@
-"""The option `--dataset-option` of all commands that read a data set."""
+"""Option `--dataset-option` of the commands that read a data set."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ DatasetOptions = Annotated[
 
 
 def parse_dataset_options(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Values by their keys; each value is read as YAML.
+    """Parse KEY=VALUE texts to a dictionary; values are parsed as YAML.
 
     Raises:
         InputError: a text is not KEY=VALUE, or its value is not YAML.
     """
-    import yaml  # here: `--help` needs none
+    import yaml  # imported here to keep `--help` fast
 
     options = {}
     for text in texts or ():

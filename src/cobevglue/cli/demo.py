@@ -1,4 +1,4 @@
-"""`cobevglue demo`: cars at a simulated junction see together; numbers, pictures, a page."""
+"""`cobevglue demo`: collaborative perception at a simulated junction; prints a comparison, writes a report page."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _NEEDED = {
     "perception": ("torch", "safetensors"),
     "simulation": ("libsumo", "embreex", "trimesh"),
 }
-"""Modules by the extra that installs them."""
+"""Required modules by the extra that installs them."""
 _NOTE_EVERY = 10  # frames
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the pictures and the page.")] = Path("cobevglue-demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Of the scene; the same seed gives the same drive.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the scene; the same seed gives the same sequence.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Simulate a junction where three cars with LiDARs see together, without GPS.
+    """Collaborative perception of three simulated cars at a junction, without GPS.
 
-    The whole system runs on the shipped weights: every car detects and tracks, BEVGlue finds the relative poses, and
-    features are fused. For comparison, the ego alone, and fusion by poses from noisy GPS, from GPS under attack, and by
-    the true poses. Writes pictures and a page on which the drive can be played.
+    The whole system runs on the shipped weights: every car detects and tracks objects, BEVGlue estimates the relative
+    poses, and features are fused. It is compared with no collaboration, and with fusion by poses from noisy GPS, from
+    GPS under attack, and by the true poses. Writes pictures and a report page with a player of the sequence.
 
     Needs: pip install 'cobevglue[perception,simulation]'
     """
@@ -45,7 +45,7 @@ def demo(
             print_note(f"{done} of {FRAMES} frames")
 
     with expected_errors():
-        out.mkdir(parents=True, exist_ok=True)  # what is wrong with it is said now, not after a minute
+        out.mkdir(parents=True, exist_ok=True)  # errors are reported before the simulation
         result = run_demo(seed, progress=note)
         from cobevglue.visualization.demo_report import comparison_table, write_demo_report
 
@@ -60,7 +60,7 @@ def demo(
         header,
         rows,
     )
-    print("off: median error of the poses; bytes: sent for the pose, a frame and car. More is on the page.")
+    print("off: median pose error; bytes: of the object message, per frame and car. See the page for more.")
     print(f"Open {files[0]} to see it ({time.perf_counter() - start:.0f} s).")
 
 

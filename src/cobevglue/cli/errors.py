@@ -1,4 +1,4 @@
-"""What may go wrong by no fault of the program, as one line."""
+"""Expected errors, reported as one line without a traceback."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ __all__ = ["InputError", "expected_errors"]
 
 
 class InputError(Exception):
-    """Bad input or a file that cannot be read or written: one line that says what and where, exit code 2."""
+    """Bad input, or a file that cannot be read or written: reported as one line, exit code 2."""
 
 
 @contextmanager
 def expected_errors() -> Iterator[None]:
-    """Around what depends on the user's input: the API refuses bad input with ValueError, the system with OSError.
+    """Convert ValueError (bad input to the API) and OSError to `InputError`.
 
-    Only these become an `InputError`; and only here: elsewhere a ValueError is a bug, and shows its traceback.
+    For code that depends on the user's input. Elsewhere a ValueError is a bug and is shown with its traceback.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""`cobevglue evaluate`: a method on a data set."""
+"""`cobevglue evaluate`: evaluation of alignment or detection on a data set."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["Dataset", "Task", "evaluate"]
 
 
 class Task(str, Enum):
-    """What can be evaluated."""
+    """Evaluation tasks."""
 
     ALIGN = "align"
     DETECT = "detect"
 
 
 class Dataset(str, Enum):
-    """Data sets by name; `simulated` is made on the way."""
+    """Data sets by name; `simulated` is generated during the evaluation."""
 
     OPV2V = "opv2v"
     V2XSET = "v2xset"
@@ -37,52 +37,52 @@ _ONLY_FOR = {
     Task.ALIGN: ("max_range", "perfect", "paper"),
     Task.DETECT: ("weights", "reach", "min_points", "scenario", "frames", "picture", "failures", "dataset_option"),
 }
-"""Options that one task knows and the other does not."""
+"""Options that only one task has."""
 
 
 def evaluate(
     context: typer.Context,
-    root: Annotated[Path | None, typer.Option(help="Root of the data set; none for simulated.")] = None,
+    root: Annotated[Path | None, typer.Option(help="Root of the data set; not for simulated.")] = None,
     task: Annotated[Task, typer.Option(help="What to evaluate.")] = Task.ALIGN,
     dataset: Annotated[Dataset, typer.Option(help="Format of the data set.")] = Dataset.OPV2V,
     split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
     dataset_option: DatasetOptions = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the detection errors, or of simulated worlds.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the detection errors, or of simulated worlds.")] = 0,
     max_range: Annotated[
         float, typer.Option(min=1.0, help="align: objects farther away are not detected, in metres.")
     ] = 70.0,
     perfect: Annotated[
-        bool, typer.Option("--perfect", help="align: labels as they are, without a detector's errors.")
+        bool, typer.Option("--perfect", help="align: use labels without simulated detection errors.")
     ] = False,
     paper: Annotated[
-        bool, typer.Option("--paper", help="align: the paper's own settings instead of the default.")
+        bool, typer.Option("--paper", help="align: use the paper's settings instead of the default.")
     ] = False,
-    weights: Annotated[str, typer.Option(help="detect: a shipped model's name, or a .safetensors file.")] = "compact",
+    weights: Annotated[str, typer.Option(help="detect: name of shipped weights, or a .safetensors file.")] = "compact",
     reach: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--range", help="detect: objects count up to this |x| and |y|, in metres; else as far as the model looks."
+            "--range", help="detect: evaluate objects up to this |x| and |y|, in metres; default: the detector's range."
         ),
     ] = None,
     min_points: Annotated[int, typer.Option(min=0, help="detect: objects with fewer points are ignored.")] = 0,
-    scenario: Annotated[str | None, typer.Option(help="detect: go through this scenario only.")] = None,
+    scenario: Annotated[str | None, typer.Option(help="detect: evaluate this scenario only.")] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="detect: look at this many clouds at most; 100 of simulated ones.")
+        int | None, typer.Option(min=1, help="detect: maximum number of clouds; default: all, or 100 simulated ones.")
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="detect: folder for a picture of every tenth cloud.")] = None,
     failures: Annotated[
-        Path | None, typer.Option(help="detect: CSV file for every missed object and false detection.")
+        Path | None, typer.Option(help="detect: CSV file of missed objects and false detections.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Measure the alignment (`--task align`) or the detector (`--task detect`) on a data set.
+    """Evaluate alignment (`--task align`) or detection (`--task detect`) on a data set.
 
-    align: BEVGlue on every pair of agents, by the number of objects both detected. The labels get a detector's errors
-    (missed, displaced, flipped and false boxes) and are tracked. Poses of the data set are the truth and never reach
-    the alignment. Wrong is what is accepted and off by more than 3 m or 3 degrees.
+    align: BEVGlue on every pair of agents, by number of co-visible objects. Detection errors (missed, displaced,
+    flipped and false boxes) are added to the labels, which are then tracked. Poses of the data set are ground truth and
+    are not passed to the aligner. Wrong alignments are those accepted with an error above 3 m or 3 degrees.
 
-    detect: PointPillars on every agent's own cloud against that agent's own labels: average precision by distance, in
-    both of its dialects, and what is wrong with the boxes found.
+    detect: PointPillars on every agent's own cloud and labels: average precision by distance, in both of its
+    definitions, and errors of the detected boxes.
     """
     _refuse_options_of_others(context, task)
     options = parse_dataset_options(dataset_option)
@@ -118,7 +118,7 @@ def evaluate(
 
 
 def _refuse_options_of_others(context: typer.Context, task: Task) -> None:
-    """An option that would have no effect is an error."""
+    """Raise an error for options of the other task."""
     for other, names in _ONLY_FOR.items():
         for name in names if other is not task else ():
             source = context.get_parameter_source(name)

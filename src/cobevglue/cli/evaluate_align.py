@@ -22,7 +22,7 @@ def evaluate_align(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Every pair of agents, with a detector's errors on the labels; prints a summary by co-visible objects."""
+    """Evaluate every pair of agents on labels with detection errors, and print a summary by co-visible objects."""
     from cobevglue import BEVGlue, BEVGlueConfig
     from cobevglue.datasets import OPV2V, V2XSet
     from cobevglue.disturbance.detection_errors import DetectionErrors

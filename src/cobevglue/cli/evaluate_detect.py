@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["SIMULATED", "DetectTask", "evaluate_detect"]
 
 SIMULATED = "simulated"
-"""In the place of a data set's name: clouds that are made on the way."""
+"""Name of the data set of clouds that are simulated during the evaluation."""
 
-_SIMULATED_CLOUDS = 100  # where the user does not say how many
+_SIMULATED_CLOUDS = 100  # default of --frames
 _PICTURE_EVERY = 10  # clouds
 _NOTE_EVERY = 10.0  # seconds
 _SCORE_THRESHOLD = 0.3
@@ -35,20 +35,20 @@ _SCORE_THRESHOLD = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class DetectTask:
-    """What to evaluate, as the user says it.
+    """Options of the evaluation.
 
     Attributes:
         root: of the data set; None for simulated clouds.
         dataset: name of the data set, or "simulated".
         split: name of the split.
-        weights: a shipped model's name, or a file that ends in .safetensors.
-        reach: |x| and |y| up to which objects count [m]; None for as far as the detector looks.
+        weights: name of shipped weights, or a .safetensors file.
+        reach: |x| and |y| up to which objects are evaluated [m]; None for the detector's range.
         min_points: objects with fewer points are ignored.
-        scenario: the only one to go through; None for all.
-        frames: how many clouds to look at, at most; None for all of a data set.
+        scenario: evaluate only this one; None for all.
+        frames: maximum number of clouds; None for all of a data set.
         seed: of simulated worlds.
         pictures: folder for pictures, or None.
-        failures: file for a list of what was missed and made up, or None.
+        failures: CSV file of missed objects and false detections, or None.
         options: further arguments of the data set's class.
     """
 
@@ -67,17 +67,17 @@ class DetectTask:
 
     @property
     def data(self) -> str:
-        """The data's name for titles."""
+        """Name of the data for titles."""
         return " ".join(part for part in (self.dataset, self.split, self.scenario) if part)
 
 
 @dataclasses.dataclass
 class _Counts:
-    """What happened on the way: agents' frames without a cloud or labels, and the time that each cloud took [s]."""
+    """Numbers of skipped frames of agents, and run time of each cloud [s]."""
 
     without_cloud: int = 0
     without_labels: int = 0
-    missing_labels: str = ""  # the error of the first of them
+    missing_labels: str = ""  # error message of the first of them
     seconds: list[float] = dataclasses.field(default_factory=list)
 
     @property
@@ -86,12 +86,12 @@ class _Counts:
 
     @property
     def milliseconds(self) -> float:
-        """Median time per cloud."""
+        """Median time per cloud [ms]."""
         return 1e3 * statistics.median(self.seconds)
 
 
 def evaluate_detect(task: DetectTask, as_json: bool) -> None:
-    """Detect in every cloud and print how well it went; progress goes to standard error."""
+    """Run the detector on every cloud and print the evaluation; progress is printed to standard error."""
     from cobevglue.evaluation.detection import evaluate_detections
 
     counts = _Counts()
@@ -151,7 +151,7 @@ def _clouds(task: DetectTask) -> Iterator[Cloud]:
 
     if task.dataset == SIMULATED:
         if task.root is not None or task.scenario is not None:
-            raise InputError("--dataset simulated has neither --root nor --scenario: its clouds are made on the way")
+            raise InputError("--dataset simulated has neither --root nor --scenario: its clouds are simulated")
         if task.options:
             raise InputError("--dataset-option is for data sets that are read, and has no effect on simulated")
         try:
@@ -172,7 +172,7 @@ def _detected(
     evaluation_range: EvaluationRange,
     counts: _Counts,
 ) -> Iterator[DetectionFrame]:
-    """What was found in each cloud; writes pictures and failures on the way, and counts."""
+    """Detections in each cloud; also writes pictures and failures, and updates `counts`."""
     from cobevglue.evaluation.detection_data import detect
 
     noted = time.perf_counter()
@@ -182,7 +182,7 @@ def _detected(
             if cloud.missing_labels is not None:
                 if not counts.without_labels:
                     counts.missing_labels = cloud.missing_labels
-                    print_note(f"a cloud is left out: {cloud.missing_labels}; others like it are counted")
+                    print_note(f"a cloud is skipped: {cloud.missing_labels}; others like it are counted")
                 counts.without_labels += 1
                 continue
             if cloud.points is None:
@@ -204,7 +204,7 @@ def _detected(
 
 
 class _FailureFile:
-    """The CSV file of failures, made when there is the first frame; does nothing where none is wanted."""
+    """CSV file of failures, created with the first frame; does nothing if the option is not set."""
 
     def __init__(self, task: DetectTask, evaluation_range: EvaluationRange, files: ExitStack) -> None:
         self._path, self._range, self._min_points, self._files = task.failures, evaluation_range, task.min_points, files
@@ -248,7 +248,7 @@ def _write_picture(
 
 
 def _print_report(task: DetectTask, report: DetectionReport, counts: _Counts) -> None:
-    """Tables: average precision by distance, errors of the boxes found, and recall by label."""
+    """Print tables: average precision by distance, errors of detected boxes, recall by label."""
     thresholds = list(report.overall.at)
     groups = {"all": report.overall, **report.by_range}
     print_table(
@@ -268,11 +268,11 @@ def _print_report(task: DetectTask, report: DetectionReport, counts: _Counts) ->
         _print_errors(report.errors, sure)
     if len(report.labels) > 1:
         print_table(
-            f"Objects found by label ({sure})",
+            f"Detected objects by label ({sure})",
             ("label", "objects", "recall"),
             [(name, str(one.truth), _percent(one.recall)) for name, one in report.labels.items()],
         )
-    print("AP sorts all detections by score; frame order is the dialect of OpenCOOD's released code.")
+    print("AP sorts all detections by score; frame order is the definition of OpenCOOD's released code.")
     print(f"Recall and precision: {sure}. {report.ignored_truth} objects were ignored.")
     none = f" {counts.without_cloud} frames of agents have no cloud." if counts.without_cloud else ""
     none += f" {counts.without_labels} clouds have no labels." if counts.without_labels else ""
@@ -282,18 +282,18 @@ def _print_report(task: DetectTask, report: DetectionReport, counts: _Counts) ->
 def _print_errors(errors: BoxErrors, sure: str) -> None:
     rows = [
         ("heading off by more than 90 degrees", _percent(errors.flipped)),
-        ("distance of centres", f"{errors.distance:.2f} m"),
-        ("  nine in ten are below", f"{errors.distance_90:.2f} m"),
-        ("forward, left (-: too far back, right)", f"{errors.longitudinal:+.2f} m, {errors.lateral:+.2f} m"),
-        ("away from the sensor, up", f"{errors.radial:+.2f} m, {errors.vertical:+.2f} m"),
-        ("yaw, flips apart", f"{math.degrees(errors.yaw):.1f} degrees"),
+        ("distance of the centres", f"{errors.distance:.2f} m"),
+        ("  90th percentile", f"{errors.distance_90:.2f} m"),
+        ("longitudinal, lateral (positive: forward, left)", f"{errors.longitudinal:+.2f} m, {errors.lateral:+.2f} m"),
+        ("radial, vertical (positive: away from the sensor, up)", f"{errors.radial:+.2f} m, {errors.vertical:+.2f} m"),
+        ("yaw, without flips", f"{math.degrees(errors.yaw):.1f} degrees"),
         ("length, width, height", ", ".join(f"{v:+.2f} m" for v in (errors.length, errors.width, errors.height))),
     ]
-    print_table(f"Median errors of the {errors.count} objects found ({sure})", ("", ""), rows)
+    print_table(f"Median errors of the {errors.count} detected objects ({sure})", ("", ""), rows)
 
 
 def _limits(report: DetectionReport) -> str:
-    """Which objects count, in words."""
+    """Description of the evaluated objects."""
     assert report.evaluation_range is not None
     x_min, x_max, y_min, y_max = report.evaluation_range
     bounds = [

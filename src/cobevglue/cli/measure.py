@@ -1,4 +1,4 @@
-"""Times the steps between two object lists and a relative pose, on made-up frames of any number of objects."""
+"""Run time of tracking, messages and alignment on synthetic frames with given numbers of objects."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ TRACK, ENCODE, DECODE = "track", "encode", "decode"
 FIRST, LATER = "BEVGlue, first frame", "BEVGlue, later frames"
 PAPER_FIRST, PAPER_LATER = "paper's settings, first frame", "paper's settings, later frames"
 STEPS = (TRACK, ENCODE, DECODE, FIRST, LATER, PAPER_FIRST, PAPER_LATER)
-"""What is timed: a frame of one tracker, a message, and an alignment without and with frames before it."""
+"""Timed steps: one tracker update, one message, and one alignment without and with previous frames."""
 
-_FRAMES = 25  # of a sequence
-_WARM_UP = 5  # frames of a sequence that are not timed
-_SECONDS_AT_MOST = 2.0  # for a step at one object count; fewer frames are then timed, at least one
-_PAPER_OBJECTS_AT_MOST = 100  # the search of the paper's settings takes minutes for more
-_SHARED = 0.6  # of the objects are seen by both agents
-_AREA_PER_OBJECT = 250.0  # [m^2]: traffic is as dense whatever the number
+_FRAMES = 25  # per sequence
+_WARM_UP = 5  # first frames of a sequence, not timed
+_SECONDS_AT_MOST = 2.0  # per step and object count; limits the number of timed frames, at least one
+_PAPER_OBJECTS_AT_MOST = 100  # with the paper's settings, more objects take minutes
+_SHARED = 0.6  # share of the objects that both agents observe
+_AREA_PER_OBJECT = 250.0  # [m^2], for a constant density of traffic
 _SEED = 0
 
 
 def measure(progress: Callable[[int], None]) -> dict[str, Any]:
-    """Time every step at every object count.
+    """Measure every step for every number of objects in `OBJECT_COUNTS`.
 
     Args:
-        progress: called with each object count before it is measured.
+        progress: is called with each number of objects before its measurement.
 
     Returns:
-        Ready for JSON: `steps[step][count]` with `median_ms`, `best_ms` and `repeats`, or None where it would take too
-        long; `message_bytes[count]`; machine and versions.
+        JSON-serialisable: `steps[step][count]` with `median_ms`, `best_ms` and `repeats`, or None for omitted slow
+        combinations; `message_bytes[count]`; machine and versions.
     """
     steps: dict[str, dict[str, Any]] = {step: {} for step in STEPS}
     message_bytes = {}
-    _run(OBJECT_COUNTS[0], _WARM_UP + 1)  # compile, or load what was compiled
+    _run(OBJECT_COUNTS[0], _WARM_UP + 1)  # compile, or load from the cache
     for count in OBJECT_COUNTS:
         progress(count)
         taken, message_bytes[str(count)] = _run(count, _FRAMES)
@@ -71,7 +71,7 @@ def _statistics(seconds: list[float]) -> dict[str, float | int]:
 
 
 def _run(count: int, frames: int) -> tuple[dict[str, list[float]], int]:
-    """Seconds that each step took in the frames of a sequence, and the length of a message."""
+    """Run times of each step in the frames of a sequence [s], and the length of a message [bytes]."""
     scene = [_scene(count, index) for index in range(frames)]
     ego_tracker, other_tracker, timed_tracker = Sort(), Sort(), Sort()
     tracked = [(ego_tracker.update(ego), other_tracker.update(other)) for ego, other in scene]
@@ -94,13 +94,13 @@ def _run(count: int, frames: int) -> tuple[dict[str, list[float]], int]:
 def _times(
     step: Callable[..., object], inputs: Sequence[tuple[Any, ...]], skip: int = 0, *, forget: bool = False
 ) -> list[float]:
-    """Seconds that a step took for each of these inputs but the first ones; it stops early after long enough.
+    """Run times of successive calls [s], up to a total of `_SECONDS_AT_MOST`.
 
     Args:
-        step: what is timed.
-        inputs: its arguments, call by call.
-        skip: how many of the first calls are not timed.
-        forget: reset whose method the step is before each call.
+        step: function or bound method to call.
+        inputs: arguments of each call.
+        skip: number of first calls that are not timed.
+        forget: call `reset()` of the object that `step` is bound to before each call.
     """
     seconds: list[float] = []
     collects = gc.isenabled()
@@ -122,7 +122,7 @@ def _times(
 
 
 def _scene(count: int, index: int) -> tuple[Boxes, Boxes]:
-    """What two agents detect of one set of standing cars in frame `index`: `count` boxes each, partly the same."""
+    """Detections of two agents in frame `index` of a scene of parked cars: `count` boxes each, 60 % in common."""
     world = np.random.default_rng([_SEED, count])
     shared = round(_SHARED * count)
     total = 2 * count - shared
@@ -139,7 +139,7 @@ def _scene(count: int, index: int) -> tuple[Boxes, Boxes]:
 
 
 def _detected(boxes: Boxes, rng: np.random.Generator) -> Boxes:
-    """The boxes as a detector has them, in no particular order."""
+    """Boxes with detection noise, in random order."""
     n = len(boxes)
     noisy = boxes.replace(
         center=boxes.center + rng.normal(0.0, 0.2, (n, 3)), yaw=boxes.yaw + rng.normal(0.0, math.radians(2.0), n)
@@ -148,7 +148,7 @@ def _detected(boxes: Boxes, rng: np.random.Generator) -> Boxes:
 
 
 def processor_name() -> str:
-    """The processor's name, where the system tells it."""
+    """Name of the processor, as reported by the system."""
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text(encoding="utf-8", errors="replace").splitlines():

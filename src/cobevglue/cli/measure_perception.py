@@ -1,4 +1,4 @@
-"""Times the steps between a stored point cloud and tracked boxes."""
+"""Run time of perception, from a stored point cloud to tracked boxes."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import numpy as np
 __all__ = ["CLOUDS", "measure_perception"]
 
 CLOUDS = 20
-"""So many frames of a simulated drive are timed, after some that are not."""
+"""Number of timed clouds, after `_WARM_UP` clouds that are not timed."""
 _WARM_UP = 3
 _NETWORK, _SEED = "junction_test_0", 0
 
 
 def measure_perception(weights: str, threads: int) -> dict[str, Any] | None:
-    """Time every stage of perception on simulated clouds of OPV2V's sensor.
+    """Measure every stage of perception on simulated clouds of OPV2V's sensor.
 
     Args:
-        weights: of the detector, a shipped name or a .safetensors file. It runs on CUDA where there is one.
-        threads: of torch.
+        weights: of the detector, a shipped name or a .safetensors file. It runs on CUDA if available.
+        threads: number of torch's threads.
 
     Returns:
-        Ready for JSON: `stages[stage]` with `median_ms` and `best_ms`; how many points a cloud had, the weights, the
-        device, the threads, and the largest memory of this process so far. None where torch or the simulation is not
-        installed.
+        JSON-serialisable: `stages[stage]` with `median_ms` and `best_ms`; mean number of points per cloud, weights,
+        device, threads, and peak memory of this process so far [MB]. None if torch or the simulation is not installed.
 
     Raises:
-        ValueError, FileNotFoundError: there are no such weights.
+        ValueError: unknown or damaged weights.
+        FileNotFoundError: the file of weights does not exist.
     """
     try:
-        import torch  # noqa: F401  # where it is missing, this says so in the way that is expected below
+        import torch  # noqa: F401  # raises the ModuleNotFoundError that is handled below
 
         from cobevglue.datasets.opv2v_writer import write_opv2v_frame
         from cobevglue.datasets.pcd import read_pcd

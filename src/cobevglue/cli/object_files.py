@@ -18,10 +18,10 @@ _JSON, _YAML = {".json"}, {".yaml", ".yml"}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FramePair:
-    """What two agents saw at one time.
+    """Object lists of two agents in one frame.
 
     Attributes:
-        name: of the frame: the file's, without its ending.
+        name: of the frame: the file name without extension.
         time: time stamp [s].
         ego: boxes in the ego's frame.
         other: boxes in the other's frame.
@@ -37,38 +37,38 @@ def read_boxes(path: Path) -> Boxes:
     """The boxes of an object list (`.json`) or of a frame of OPV2V (`.yaml`), in their own agent's frame.
 
     Raises:
-        ValueError: the content is wrong, or the ending is another; names the file.
+        ValueError: invalid content or another file extension; the message names the file.
         OSError: the file cannot be read.
     """
     if path.suffix.lower() in _JSON:
         return read_object_list(path)
     if path.suffix.lower() in _YAML:
-        return read_opv2v_labels(path)[1]  # without lidar_pose: nothing that follows sees it
+        return read_opv2v_labels(path)[1]  # without lidar_pose, which aligners must not receive
     raise ValueError(f"{path}: an object list ends with .json, a frame of OPV2V with .yaml")
 
 
 def read_pairs(ego: Path, other: Path) -> tuple[list[FramePair], list[str]]:
-    """One pair of files, or the frames of two folders that have the same name.
+    """Read one pair of files, or pair the frames of two folders by name.
 
-    In folders, frames are 0.1 s apart in the order of all names that occur in either: a frame that one agent misses is
-    a gap. Where boxes come without track ids, they are tracked.
+    In folders, the union of the frame names in both, in order, has a period of 0.1 s; a frame without a file of one
+    agent is a gap. Boxes without track ids are tracked.
 
     Args:
         ego: a file or a folder of the ego.
-        other: the same of the other agent.
+        other: a file or a folder of the other agent.
 
     Returns:
-        The pairs in order, at least one, and remarks for the user.
+        The pairs in order, at least one, and notes for the user.
 
     Raises:
-        ValueError: a file is wrong, only one of the two is a folder, or no frame has a partner.
+        ValueError: invalid content of a file, a file together with a folder, or no frame in both folders.
         OSError: a file cannot be read.
     """
     if not ego.is_dir() and not other.is_dir():
         return [FramePair(_pair_name(ego, other), 0.0, read_boxes(ego), read_boxes(other))], []
     for one, two in ((ego, other), (other, ego)):
         if not one.is_dir():
-            one.stat()  # if it is not there, that is the error to report
+            one.stat()  # raises if the file does not exist
             raise ValueError(f"{one} is a file, but {two} is a folder: give two files or two folders")
     ego_files, other_files = _frames(ego), _frames(other)
     names = sorted(ego_files.keys() | other_files.keys(), key=_frame_order)
@@ -79,7 +79,7 @@ def read_pairs(ego: Path, other: Path) -> tuple[list[FramePair], list[str]]:
     ego_boxes, other_boxes = _tracked(ego_files, times), _tracked(other_files, times)
     pairs = [FramePair(name, times[name], ego_boxes[name], other_boxes[name]) for name in common]
     alone = len(names) - len(common)
-    return pairs, [f"{alone} of {len(names)} frames have no partner and are left out"] if alone else []
+    return pairs, [f"{alone} of {len(names)} frames have no partner and are skipped"] if alone else []
 
 
 def _pair_name(ego: Path, other: Path) -> str:
@@ -87,7 +87,7 @@ def _pair_name(ego: Path, other: Path) -> str:
 
 
 def _frames(folder: Path) -> dict[str, Path]:
-    """The object lists and OPV2V frames (all digits, as data sets number them) of a folder by name."""
+    """Object lists and OPV2V frames (names of digits only) of a folder by name."""
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         kind = path.suffix.lower()
@@ -101,13 +101,13 @@ def _frames(folder: Path) -> dict[str, Path]:
 
 
 def _frame_order(name: str) -> tuple[bool, int, str]:
-    """Numbers by their size and before other names: frame 9 is before frame 10."""
+    """Sort key: numeric order, then other names; frame 9 is before frame 10."""
     is_number = name.isdecimal()
     return not is_number, int(name) if is_number else 0, name
 
 
 def _tracked(files: dict[str, Path], times: dict[str, float]) -> dict[str, Boxes]:
-    """The boxes of all frames by name; tracked, unless all that there are come with ids."""
+    """Boxes of all frames by name; tracked, unless all have track ids."""
     frames = {name: read_boxes(files[name]) for name in times if name in files}
     if all(boxes.track_id is not None for boxes in frames.values() if len(boxes)):
         return frames

@@ -1,4 +1,4 @@
-"""What commands print: results to standard output, as text or one JSON document; progress to standard error."""
+"""Output of commands: results (tables or one JSON document) to standard output, progress to standard error."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from typing import Any
 __all__ = ["print_json", "print_note", "print_table"]
 
 _INNERMOST_LIST = re.compile(r"\[\s*\n([^\[\]{}\"]*?)\s*\]")
-"""A list of numbers over several lines; it is printed on one. (No string of JSON has a line break in it.)"""
+"""A list of numbers over several lines, which is joined to one line. JSON strings contain no line breaks."""
 
 
 def print_json(document: dict[str, Any]) -> None:
-    """Print a JSON document to standard output; what is not finite becomes null, as JSON knows no NaN."""
+    """Print a JSON document to standard output; non-finite numbers become null."""
     text = json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
     print(_INNERMOST_LIST.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text))
 
 
 def print_note(text: str) -> None:
-    """A line of progress or explanation, to standard error."""
+    """Print a line of progress or explanation to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table to standard output: the first column at the left, the others at the right."""
+    """Print a table to standard output: the first column left-aligned, the others right-aligned."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -45,13 +45,13 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*row)
     console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:  # into a file or a pipe: as wide as it takes, without wrapping
+    if not console.is_terminal:  # to a file or a pipe: without wrapping
         console.width = 200
     console.print(table)
 
 
 def _finite(value: Any) -> Any:
-    """`value` with null in the place of every number that is not finite."""
+    """`value` with None in place of non-finite numbers."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -32,56 +32,59 @@ _REAL_SPLIT = "test_culvercity"
 def reproduce(
     context: typer.Context,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Minutes instead of an hour: few sequences, frames and conditions.")
+        bool, typer.Option("--quick", help="Minutes instead of an hour: fewer sequences, frames and conditions.")
     ] = False,
     dataset: Annotated[str, typer.Option(help="simulated, opv2v, v2xset, v2v4real or dair-v2x.")] = "simulated",
-    root: Annotated[Path | None, typer.Option(help="Root of the data set; none for simulated.")] = None,
+    root: Annotated[Path | None, typer.Option(help="Root of the data set; not for simulated.")] = None,
     split: Annotated[str, typer.Option(help="Name of the split.")] = "test",
     real: Annotated[
-        Path | None, typer.Option(help="Root of OPV2V, whose split test_culvercity is reported beside the other data.")
+        Path | None, typer.Option(help="Root of OPV2V; its split test_culvercity is reported, too.")
     ] = None,
     dataset_option: DatasetOptions = None,
-    out: Annotated[Path, typer.Option(help="Folder of the report; an interrupted run goes on in it.")] = Path("report"),
+    out: Annotated[Path, typer.Option(help="Folder of the report; an interrupted run is resumed in it.")] = Path(
+        "report"
+    ),
     tables: Annotated[
         str | None,
         typer.Option(
-            help="Only these, with commas: noise, attack, registration, ablation, disturbances, pose, communication, "
-            "time."
+            help="Only these, separated by commas: noise, attack, registration, ablation, disturbances, pose, "
+            "communication, time."
         ),
     ] = None,
     methods: Annotated[
-        str | None, typer.Option(help="Only these fusion methods, with commas, beside none and cobevglue.")
+        str | None, typer.Option(help="Only these fusion methods, separated by commas, besides none and cobevglue.")
     ] = None,
     scenarios: Annotated[
-        int | None, typer.Option(min=1, help="So many sequences at most; 20 of simulated ones if left out.")
+        int | None, typer.Option(min=1, help="Maximum number of sequences; default: all, or 20 simulated ones.")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="So many frames of each sequence; 20 of simulated ones if left out.")
+        int | None,
+        typer.Option(min=1, help="Maximum number of frames per sequence; default: all, or 20 of simulated ones."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of simulated sequences and all that goes wrong.")] = None,
-    detector: Annotated[str, typer.Option(help="A shipped model's name, or a .safetensors file.")] = "compact",
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of simulated sequences and of all disturbances.")
+    ] = None,
+    detector: Annotated[str, typer.Option(help="Name of shipped weights, or a .safetensors file.")] = "compact",
     weights: Annotated[
         Path | None, typer.Option(help="Folder with weights of the fusion methods, NAME.safetensors.")
     ] = None,
     untrained: Annotated[
-        bool, typer.Option("--untrained", help="Fusion methods without weights of their own, to try things out.")
+        bool, typer.Option("--untrained", help="Use fusion methods without trained weights, for tests.")
     ] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
-    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")] = None,
     use_ray: Annotated[
-        bool, typer.Option("--ray", help="On the Ray cluster at RAY_ADDRESS, or a local one of --workers processes.")
+        bool, typer.Option("--ray", help="Use the Ray cluster at RAY_ADDRESS, or a local one of --workers processes.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Reproduce the paper's tables and figures, on simulated sequences or on a data set of yours.
+    """Reproduce the paper's tables and figures on simulated sequences or on a data set.
 
-    Every fusion method under localisation noise and attack, registration of points, ablation, other disturbances,
-    quality of poses, communication and time. Writes index.html, report.md and CSV files; with a data set of the paper,
-    its own numbers stand beside.
+    Every fusion method under localisation noise and attack, point cloud registration, ablation, other disturbances,
+    pose accuracy, communication volume and run time. Writes index.html, report.md and CSV files; for a data set of the
+    paper, the published numbers are shown, too.
 
-    What was run is kept in the folder: the same command goes on where it was interrupted, and with other --tables runs
-    only what is missing.
+    Results are stored in the folder: the same command resumes an interrupted run, and with other --tables computes only
+    missing results.
     """
     start = time.perf_counter()
     try:
@@ -105,7 +108,7 @@ def reproduce(
         StudySettings(dataset=dataset, root=None if root is None else str(root), split=split, reader=options, **common)
     ]
     if real is not None:
-        # Not all of its sequences have clouds: those without are no reason to look at fewer.
+        # Sequences without clouds are skipped, so the number of sequences is not limited.
         studies.append(
             StudySettings(dataset="opv2v", root=str(real), split=_REAL_SPLIT, **{**common, "scenarios": None})
         )
@@ -145,11 +148,11 @@ def reproduce(
         return
     (summary,) = made[""]
     print_table(summary.title, summary.columns, summary.text_rows())
-    print(f"Open {out / 'index.html'} to see all of it ({minutes:.1f} minutes).")
+    print(f"Open {out / 'index.html'} for the full report ({minutes:.1f} minutes).")
 
 
 def _about(context: typer.Context, studies: Sequence[StudySettings]) -> list[str]:
-    """Command, seed, versions, machine and date, a line each."""
+    """Command, seed, versions, machine and date, one line each."""
     from cobevglue.cli.measure import processor_name
 
     installed = {distribution.name: distribution.version for distribution in distributions()}
@@ -167,20 +170,20 @@ def _about(context: typer.Context, studies: Sequence[StudySettings]) -> list[str
 
 
 def _command(context: typer.Context) -> str:
-    """What the user typed, option by option."""
+    """The command line, reconstructed from the options that were given."""
     words = []
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if source is not None and source.name == "COMMANDLINE":
             value = context.params[parameter.name or ""]
-            values = value if isinstance(value, list | tuple) else [value]  # a repeated option is repeated
+            values = value if isinstance(value, list | tuple) else [value]  # one option per value
             words += [parameter.opts[0]] if value is True else [w for v in values for w in (parameter.opts[0], str(v))]
     return f"{context.command_path} {shlex.join(words)}"
 
 
 @contextmanager
 def _progress_bar() -> Iterator[Callable[[str, float, float], None]]:
-    """A bar on standard error for each data set, with the time that is left."""
+    """Progress bar on standard error for each data set, with the remaining time."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -207,10 +210,10 @@ def _progress_bar() -> Iterator[Callable[[str, float, float], None]]:
     def show(label: str, done: float, total: float) -> None:
         nonlocal noted
         if label not in tasks:
-            bar.start()  # with the first frame: what is wrong from the beginning is said without a bar
+            bar.start()  # with the first frame, so that early errors are printed without a bar
             tasks[label] = bar.add_task(label, total=total)
         bar.update(tasks[label], completed=done, total=total)
-        if not console.is_terminal and time.perf_counter() - noted > 60.0:  # a log gets a line a minute
+        if not console.is_terminal and time.perf_counter() - noted > 60.0:  # in a log, one line per minute
             noted = time.perf_counter()
             left = bar.tasks[tasks[label]].time_remaining
             print_note(f"{label}: {done / total:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))

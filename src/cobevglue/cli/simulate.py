@@ -1,4 +1,4 @@
-"""`cobevglue simulate`: drives of several agents as a data set, clouds and labels."""
+"""`cobevglue simulate`: simulated scenarios of several agents as a data set of clouds and labels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Format(str, Enum):
 
 
 class Split(str, Enum):
-    """Splits; no road network is in two of them."""
+    """Splits; their road networks are disjoint."""
 
     TRAIN = "train"
     VALIDATION = "validation"
@@ -36,7 +36,7 @@ class Split(str, Enum):
 
 
 class LidarName(str, Enum):
-    """Sensors of vehicles."""
+    """LiDAR sensors of vehicles."""
 
     OPV2V = "opv2v"
     BEAMS32 = "beams32"
@@ -44,34 +44,34 @@ class LidarName(str, Enum):
 
 
 def simulate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set; made if it is not there.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set; created if missing.")],
     kind: Annotated[Format, typer.Option("--format", help="Layout of the files.")] = Format.OPV2V,
     split: Annotated[
         Split | None,
-        typer.Option(help="Whose road networks; also the folder's name. 'test' unless --network is of another."),
+        typer.Option(help="Split of the road networks, and name of the folder; default: that of --network, or test."),
     ] = None,
-    scenarios: Annotated[int, typer.Option(min=1, max=1000, help="How many drives.")] = 1,
-    frames: Annotated[int, typer.Option(min=1, max=9999, help="Of each drive, 10 a second.")] = 80,
+    scenarios: Annotated[int, typer.Option(min=1, max=1000, help="Number of scenarios.")] = 1,
+    frames: Annotated[int, typer.Option(min=1, max=9999, help="Frames per scenario, at 10 Hz.")] = 80,
     agents: Annotated[
-        int | None, typer.Option(min=1, max=8, help="Vehicles with a LiDAR; 2 unless the format says otherwise.")
+        int | None, typer.Option(min=1, max=8, help="Vehicles with a LiDAR; default: that of the format, or 2.")
     ] = None,
     roadside_units: Annotated[
-        int | None, typer.Option(min=0, max=4, help="LiDARs on masts; 0 unless the format says otherwise.")
+        int | None, typer.Option(min=0, max=4, help="Roadside LiDARs; default: that of the format, or 0.")
     ] = None,
-    lidar: Annotated[LidarName, typer.Option(help="The vehicles' sensor.")] = LidarName.OPV2V,
-    network: Annotated[str | None, typer.Option(help="One road network; all of the split in turn if left out.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of worlds and traffic.")] = 0,
-    labels_only: Annotated[bool, typer.Option("--labels-only", help="Write no point clouds.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; as many as there are cores if left out.")
+    lidar: Annotated[LidarName, typer.Option(help="LiDAR sensor of the vehicles.")] = LidarName.OPV2V,
+    network: Annotated[
+        str | None, typer.Option(help="Name of the road network; default: all of the split in turn.")
     ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of worlds and traffic.")] = 0,
+    labels_only: Annotated[bool, typer.Option("--labels-only", help="Do not write point clouds.")] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Simulate drives of several vehicles with LiDARs, and write them as a data set.
+    """Simulate several vehicles with LiDARs in traffic, and write a data set.
 
-    Traffic is SUMO's on stored road networks. Labels are exact: the vehicles that at least one point lies on, with the
-    number of points. --format v2v4real has two vehicles, dair-v2x one and a roadside unit. The same options give the
-    same files, and if it is interrupted, the same command goes on where it stopped.
+    Traffic is simulated by SUMO on stored road networks. Labels are exact: vehicles with at least one point, and their
+    numbers of points. --format v2v4real has two vehicles, dair-v2x one vehicle and a roadside unit. The same options
+    give the same files, and the same command resumes an interrupted run.
 
     Needs: pip install 'cobevglue[simulation]'
     """
@@ -110,7 +110,7 @@ def simulate(
     else:
         print(
             f"{out}: {scenarios} x {frames} frames of {settings.agents + settings.roadside_units} agents, "
-            f"{report.frames_written} written, {report.frames_kept} were there already"
+            f"{report.frames_written} written, {report.frames_kept} existed already"
         )
 
 
@@ -128,7 +128,7 @@ def _split_name(split: Split | None, of_network: str | None, network: str | None
 
 @contextmanager
 def _progress_bar() -> Iterator[Callable[[int, int], None]]:
-    """A bar on standard error; gives what to call with how many are done and how many there are."""
+    """Progress bar on standard error; yields a function of the numbers of completed and of all frames."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -137,7 +137,7 @@ def _progress_bar() -> Iterator[Callable[[int, int], None]]:
     task = bar.add_task("frames", total=None)
 
     def show(done: int, total: int) -> None:
-        bar.start()  # with the first frame: what is wrong from the beginning is said without a bar
+        bar.start()  # with the first frame, so that early errors are printed without a bar
         bar.update(task, completed=done, total=total)
 
     try:

@@ -1,4 +1,4 @@
-"""`cobevglue train`: a stage of training."""
+"""`cobevglue train`: training of the detector, its heading refinement, or a fusion method."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Stage", "train"]
 
 
 class Stage(str, Enum):
-    """What can be trained."""
+    """Stages of training."""
 
     DETECTOR = "detector"
     HEADING = "heading"
@@ -24,25 +24,25 @@ class Stage(str, Enum):
 
 
 def train(
-    stage: Annotated[Stage, typer.Argument(help="What to train.")],
+    stage: Annotated[Stage, typer.Argument(help="Stage of training.")],
     config: Annotated[
-        str, typer.Option(help="Name of shipped settings (of fusion: the method), or a YAML file that overrides them.")
+        str, typer.Option(help="Name of a preset (for fusion: the method), or a YAML file that overrides one.")
     ],
-    out: Annotated[Path | None, typer.Option(help="Folder of the run; runs/STAGE-CONFIG if left out.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in that folder.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run; default: runs/STAGE-CONFIG.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume the run in that folder.")] = False,
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a setting: optimisation.epochs=3. May be repeated."),
     ] = None,
     max_minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after the last epoch that is done in this time.")
+        float | None, typer.Option(min=0.0, help="Time limit; stop before an epoch that would exceed it.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
-    """Train a network; weights, state, log and TensorBoard events go to one folder.
+    """Train a network; weights, state, log and TensorBoard events are written to one folder.
 
-    An interrupted run goes on after its last full epoch with --resume, as if it had never stopped. For many processes,
-    start it with torchrun: torchrun --nproc-per-node 2 -m cobevglue train detector --config compact
+    --resume continues an interrupted run after its last complete epoch, with the same result as without interruption.
+    For several processes, use torchrun: torchrun --nproc-per-node 2 -m cobevglue train detector --config compact
     """
     try:
         from cobevglue.training import (
@@ -63,7 +63,7 @@ def train(
                 settings = load_config(config, changes or ())
                 result = train_detector(settings, folder, resume=resume, max_minutes=max_minutes)
             elif max_minutes is not None:
-                raise ValueError("--max-minutes: is for the detector; all else takes minutes")
+                raise ValueError("--max-minutes: is for the detector only; the other stages take minutes")
             elif stage is Stage.HEADING:
                 result = train_heading(load_heading_config(config, changes or ()), folder, resume=resume)
             else:
@@ -73,7 +73,7 @@ def train(
     except KeyboardInterrupt:
         if (folder / "state.pt").is_file():
             print_note(
-                f"the run in {folder} keeps its last full epoch; the same command with --resume goes on from there"
+                f"the last complete epoch is saved in {folder}; the same command with --resume continues from there"
             )
         raise
     if as_json:

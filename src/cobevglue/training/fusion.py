@@ -239,13 +239,13 @@ def _sample(frame: FusionFrame, agents: int, noise: tuple[float, float], rng: np
         SE2(*(np.array([pose.x, pose.y, pose.yaw]) + rng.normal(size=3) * deviation)) for pose in world_SE2_true
     ]
 
-    def seen_from_ego(world: Sequence[SE2]) -> list[SE2]:
+    def in_ego_frame(world: Sequence[SE2]) -> list[SE2]:
         return [SE2(), *(world[0].inverse() @ pose for pose in world[1:])]
 
     return FusionSample(
         observations=frame.observations[:agents],
-        ego_SE2_agent=seen_from_ego(world_SE2_claimed),
-        true_ego_SE2_agent=seen_from_ego(world_SE2_true),
+        ego_SE2_agent=in_ego_frame(world_SE2_claimed),
+        true_ego_SE2_agent=in_ego_frame(world_SE2_true),
         early_features=frame.early_features if agents == len(frame.observations) else None,
         truth=frame.truth[~frame.ignored],
     )

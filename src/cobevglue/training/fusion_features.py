@@ -87,8 +87,8 @@ class FusionFrame:
         order = [number, *(other for other in range(len(self.observations)) if other != number)]
         poses = self.world_SE3_agent[order]
         truth = transform_boxes(self.truth, inverse_SE3(poses[0]) @ self.world_SE3_agent[0])
-        seen = tuple(self.observations[agent] for agent in order)
-        return FusionFrame(seen, poses, None, truth, self.ignored | covers_origin(truth))
+        observations = tuple(self.observations[agent] for agent in order)
+        return FusionFrame(observations, poses, None, truth, self.ignored | covers_origin(truth))
 
 
 def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_points: int) -> FusionFrame:
@@ -105,7 +105,7 @@ def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_
     """
     clouds = [_cropped(frame, agent, detector.config) for agent in agents]
     poses = np.stack([frame.agents[agent].world_SE3_lidar for agent in agents])
-    seen = tuple(Perception(detector).step(cloud) for cloud in clouds)
+    observations = tuple(Perception(detector).step(cloud) for cloud in clouds)
     truth = frame.ground_truth(agents[0], include_ego=True)
     points = np.zeros(len(truth), dtype=np.int64)
     received = []
@@ -116,7 +116,7 @@ def make_frame(frame: Frame, agents: Sequence[str], detector: PointPillars, min_
         merged = torch.from_numpy(merge_points(clouds[0], received[1:]))
         first, second, third = detector.multiscale(detector.encode([merged]))
     ignored = (points < min_points) | covers_origin(truth)
-    return FusionFrame(seen, poses, (first[0], second[0], third[0]), truth, ignored)
+    return FusionFrame(observations, poses, (first[0], second[0], third[0]), truth, ignored)
 
 
 class FusionFrames:
@@ -163,9 +163,9 @@ def write_features(
     """
     wanted = {"config": json.loads(config.model_dump_json()), "encoder": fingerprint(detector)}
 
-    def progress(drives: int, frames: int) -> None:
-        if drives % 10 == 0 or drives == config.scenarios:
-            report(f"features of {drives} of {config.scenarios} drives, {frames} frames")
+    def progress(scenarios: int, frames: int) -> None:
+        if scenarios % 10 == 0 or scenarios == config.scenarios:
+            report(f"features of {scenarios} of {config.scenarios} scenarios, {frames} frames")
 
     write = partial(_write_scenario, folder, config, detector)
     write_shards(folder, wanted, config.scenarios, write, processes, progress)
@@ -227,7 +227,7 @@ def _read(file: Path) -> FusionFrame:
         first, second, third = (tensors[f"{name}.map{i}"].float() for i in range(3))
         return first, second, third
 
-    seen = tuple(
+    observations = tuple(
         PerceptionOutput(
             points=tensors[f"{i}.points"].numpy(),
             features=maps(str(i)),
@@ -239,7 +239,7 @@ def _read(file: Path) -> FusionFrame:
         for i in range(len(tensors["poses"]))
     )
     truth = _boxes(tensors["truth"]).replace(score=None)
-    return FusionFrame(seen, tensors["poses"].numpy(), maps("early"), truth, tensors["ignored"].numpy())
+    return FusionFrame(observations, tensors["poses"].numpy(), maps("early"), truth, tensors["ignored"].numpy())
 
 
 def _rows(boxes: Boxes) -> FloatArray:

@@ -175,8 +175,9 @@ def _examples(
     }
     source = make_source(config.data, config.seed, validation=measured)
     folder = config.examples / split
-    look = autocast(config.optimisation, device)
-    return write_heading_examples(folder, source, described, detector, config.threads, look, device, report).to(device)
+    precision = autocast(config.optimisation, device)
+    examples = write_heading_examples(folder, source, described, detector, config.threads, precision, device, report)
+    return examples.to(device)
 
 
 def _train_epoch(
@@ -190,30 +191,30 @@ def _train_epoch(
     optimisation = config.optimisation
     progress = EpochProgress(optimisation, epoch, log, report, every=config.report_every)
     rng = np.random.default_rng([config.seed, _SAMPLE_STREAM, epoch])
-    device = examples.right.device
+    device = examples.correct.device
     random = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
     learner.model.train()
     for step in progress.steps:
-        rows = torch.from_numpy(rng.integers(len(examples.right), size=optimisation.batch_size))
+        rows = torch.from_numpy(rng.integers(len(examples.correct), size=optimisation.batch_size))
         batch = examples.take(rows.to(device))
-        looks = augmented(batch.looks, config.augmentation, random)
+        inputs = augmented(batch.inputs, config.augmentation, random)
         with autocast(optimisation, device):
-            logits = learner.model(looks)
-        loss = F.binary_cross_entropy_with_logits(logits, batch.right.float())
+            logits = learner.model(inputs)
+        loss = F.binary_cross_entropy_with_logits(logits, batch.correct.float())
         rate, _ = learner.learn(loss, step, progress.all_steps)
-        flipped = ((logits.detach() > 0) != batch.right).float().mean()
+        flipped = ((logits.detach() > 0) != batch.correct).float().mean()
         progress.add({"total": loss, "flipped": flipped}, rate)
 
 
-def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.Generator) -> HeadingInputs:
+def augmented(inputs: HeadingInputs, config: HeadingAugmentation, random: torch.Generator) -> HeadingInputs:
     """Augment the inputs for K vehicles; their true headings do not change.
 
     Args:
-        looks: inputs, with points in float32.
+        inputs: with points in float32.
         config: settings of the augmentation.
         random: generator on the device of the inputs.
     """
-    points, number, vehicle, around = looks
+    points, number, vehicle, around = inputs
     k, most = points.shape[:2]
 
     def uniform(*shape: int) -> Tensor:
@@ -233,13 +234,13 @@ def augmented(looks: HeadingInputs, config: HeadingAugmentation, random: torch.G
 @torch.inference_mode()
 def _validate(net: HeadingRefiner, examples: HeadingExamples, report: Callable[[str], None]) -> dict[str, float]:
     """The loss, and the share of vehicles with a heading error above 90 degrees before and after refinement."""
-    right = examples.right
-    every = torch.arange(len(right), device=right.device)
-    logits = torch.cat([net(examples.take(rows).looks) for rows in torch.split(every, 1024)])
+    correct = examples.correct
+    every = torch.arange(len(correct), device=correct.device)
+    logits = torch.cat([net(examples.take(rows).inputs) for rows in torch.split(every, 1024)])
     metrics = {
-        "loss": float(F.binary_cross_entropy_with_logits(logits, right.float())),
-        "flipped_before": float((~right).float().mean()),
-        "flipped": float(((logits >= 0) != right).float().mean()),
+        "loss": float(F.binary_cross_entropy_with_logits(logits, correct.float())),
+        "flipped_before": float((~correct).float().mean()),
+        "flipped": float(((logits >= 0) != correct).float().mean()),
     }
     report("validated: " + " ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
     return metrics

@@ -31,7 +31,7 @@ from cobevglue.training.shards import read_index, write_shards
 
 __all__ = ["HeadingExamples", "examples_in", "write_heading_examples"]
 
-_FOUND = 0.5
+_MATCH_IOU = 0.5
 """Minimum bird's-eye-view IoU of a detection and its object, as in the evaluation of AP@0.5."""
 
 
@@ -40,21 +40,21 @@ class HeadingExamples:
     """K detected vehicles.
 
     Attributes:
-        looks: inputs of the refinement; points in float16, which resolves millimetres.
-        right: (K,) whether the heading of each detection is within 90 degrees of the true one.
+        inputs: of the refinement; points in float16, which resolves millimetres.
+        correct: (K,) whether the heading of each detection is within 90 degrees of the true one.
     """
 
-    looks: HeadingInputs
-    right: Tensor
+    inputs: HeadingInputs
+    correct: Tensor
 
     def to(self, device: torch.device) -> HeadingExamples:
         """Copy to a device."""
-        return HeadingExamples(HeadingInputs(*(values.to(device) for values in self.looks)), self.right.to(device))
+        return HeadingExamples(HeadingInputs(*(values.to(device) for values in self.inputs)), self.correct.to(device))
 
     def take(self, rows: Tensor) -> HeadingExamples:
         """The examples in `rows` (R,), with points in float32."""
-        looks = HeadingInputs(*(values[rows] for values in self.looks))
-        return HeadingExamples(looks._replace(points=looks.points.float()), self.right[rows])
+        inputs = HeadingInputs(*(values[rows] for values in self.inputs))
+        return HeadingExamples(inputs._replace(points=inputs.points.float()), self.correct[rows])
 
 
 @torch.inference_mode()
@@ -66,11 +66,11 @@ def examples_in(cloud: LabelledCloud, detector: PointPillars, min_points: int) -
     iou = bev_iou(found.boxes, cloud.boxes)
     best = iou.max(axis=1, initial=0.0)
     of = iou.argmax(axis=1) if len(cloud.boxes) else np.zeros(len(iou), dtype=np.int64)
-    known = np.flatnonzero(best >= _FOUND)
+    known = np.flatnonzero(best >= _MATCH_IOU)
     known = known[cloud.point_count[of[known]] >= min_points]
-    right = np.abs(wrap_angle(found.boxes.yaw[known] - cloud.boxes.yaw[of[known]])) <= math.pi / 2
-    looks = HeadingInputs(*(values[torch.from_numpy(known)] for values in heading_inputs(points, found)))
-    return HeadingExamples(looks._replace(points=looks.points.half()), torch.from_numpy(right))
+    correct = np.abs(wrap_angle(found.boxes.yaw[known] - cloud.boxes.yaw[of[known]])) <= math.pi / 2
+    inputs = HeadingInputs(*(values[torch.from_numpy(known)] for values in heading_inputs(points, found)))
+    return HeadingExamples(inputs._replace(points=inputs.points.half()), torch.from_numpy(correct))
 
 
 def write_heading_examples(
@@ -103,10 +103,10 @@ def write_heading_examples(
 
     def progress(done: int, _: int) -> None:
         if done % 20 == 0 or done == episodes:
-            report(f"{folder}: looked at {done} of {episodes} episodes")
+            report(f"{folder}: {done} of {episodes} episodes processed")
 
-    first_look = nn.ModuleList([detector.pillars, detector.backbone, detector.neck, detector.head])
-    settings = {"config": dict(config), "detector": fingerprint(first_look)}
+    first_stage = nn.ModuleList([detector.pillars, detector.backbone, detector.neck, detector.head])
+    settings = {"config": dict(config), "detector": fingerprint(first_stage)}
     write = partial(_write, folder, source, detector, autocast, device, config["min_points"])
     write_shards(folder, settings, episodes, write, processes, progress)
     return _read(folder)
@@ -126,13 +126,13 @@ def _write(
         examples = [examples_in(cloud, detector, min_points) for cloud in source.episode(episode)]
     if not examples:
         return []
-    looks = {
+    inputs = {
         name: torch.cat(values)
-        for name, values in zip(HeadingInputs._fields, zip(*(e.looks for e in examples), strict=True), strict=True)
+        for name, values in zip(HeadingInputs._fields, zip(*(e.inputs for e in examples), strict=True), strict=True)
     }
     file = folder / f"{episode:04d}.safetensors"
-    with whole_file(file) as partly:
-        save_file({**looks, "right": torch.cat([e.right for e in examples])}, partly)
+    with whole_file(file) as partial_file:
+        save_file({**inputs, "right": torch.cat([e.correct for e in examples])}, partial_file)
     return [file.name]
 
 
