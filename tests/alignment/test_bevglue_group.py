@@ -204,7 +204,7 @@ def test_settings_that_make_no_sense() -> None:
         BEVGlueGroup(BEVGlueConfig.paper())
 
 
-def test_hypotheses_of_a_pair_are_sorted_and_positive_definite() -> None:
+def test_hypotheses_are_sorted_and_positive_definite() -> None:
     world, poses = car_park(0)
     boxes = [observation.boxes for observation in views(world, poses, 0).values()]
     assert boxes[0] is not None
