@@ -264,25 +264,18 @@ class Sort:
         left = np.flatnonzero(~np.isin(np.arange(len(boxes)), columns))
         if not len(new) or not len(left):
             return _NONE, _NONE
-        from scipy.optimize import linear_sum_assignment
-
         offset = (_plane(boxes)[left][None, :] - s.position[new][:, None]) * np.exp(-1j * s.yaw[new])[:, None]
         turn = np.abs(np.sin(boxes.yaw[left][None, :] - s.yaw[new][:, None]))
         longer = np.abs(boxes.size[left, 0][None, :] - s.shape[new, 0][:, None])
         same = (np.abs(offset.imag) < _ASIDE) & (turn < _SAME_ROAD) & (longer < _SAME_LENGTH)
-        gate = self.config.max_speed * dt
-        cost = np.where(same, np.abs(offset.real), np.inf)
-        found, taken = linear_sum_assignment(np.minimum(cost, gate))
-        inside = cost[found, taken] < gate
-        return new[found[inside]], left[taken[inside]]
+        found, taken = _assign_within(np.where(same, np.abs(offset.real), np.inf), self.config.max_speed * dt)
+        return new[found], left[taken]
 
     def _assign(self, at: _ComplexArray, boxes: Boxes) -> tuple[IntArray, IntArray]:
         """The cheapest one-to-one assignment of tracks, predicted `at` (N,), to boxes, within the gate.
 
         No pair costs more than the gate: a good pair is never given up so that a bad one fits in as well.
         """
-        from scipy.optimize import linear_sum_assignment
-
         if self.config.affinity == "giou":
             from cobevglue._iou_kernels import giou_matrix
 
@@ -294,9 +287,7 @@ class Sort:
             offset = at[:, None] - _plane(boxes)
             cost = offset.real**2 + offset.imag**2
             gate = self.config.max_distance**2
-        rows, columns = linear_sum_assignment(np.minimum(cost, gate))
-        inside = cost[rows, columns] < gate
-        return rows[inside], columns[inside]
+        return _assign_within(cost, gate)
 
     def _correct(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float, votes: FloatArray) -> None:
         """The Kalman update of the associated tracks; heading and shape by a share of what is new in the detection."""
@@ -332,6 +323,15 @@ class Sort:
             self._next_id += len(new)
             self._tracks.append(ids[new], boxes, new, time, votes, self.config)
         return ids
+
+
+def _assign_within(cost: FloatArray, gate: float) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the cheapest one-to-one assignment, of pairs that cost less than the gate only."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(np.minimum(cost, gate))
+    inside = cost[rows, columns] < gate
+    return rows[inside], columns[inside]
 
 
 class _FrameMotion:

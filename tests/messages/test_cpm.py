@@ -23,18 +23,10 @@ pytest.importorskip("asn1tools")
 from cobevglue.messages.cpm import MAX_OBJECTS, OWN_VEHICLE, CollectivePerception, decode, encode
 from cobevglue.messages.cpm_schema import SCHEMA, decode_type, encode_type
 
+from .sample_boxes import boxes
+
 ARRAYS = ("velocity", "age", "measurement_offset", "position_std", "yaw_std")
 BODY = Boxes([(0.4, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
-
-
-def boxes(n: int = 2, **changes: Any) -> Boxes:
-    columns: dict[str, Any] = {
-        "center": np.arange(3 * n, dtype=float).reshape(n, 3) + 0.25,
-        "size": np.tile([4.5, 2.0, 1.5], (n, 1)),
-        "yaw": np.linspace(-3, 3, n),
-        "track_id": np.arange(n) + 7,
-    }
-    return Boxes(**{**columns, **changes})
 
 
 def message(**changes: Any) -> CollectivePerception:

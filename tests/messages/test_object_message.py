@@ -24,15 +24,7 @@ from cobevglue.messages import (
     encoded_size,
 )
 
-
-def boxes(n: int = 2, **changes: Any) -> Boxes:
-    columns: dict[str, Any] = {
-        "center": np.arange(3 * n, dtype=float).reshape(n, 3) + 0.25,
-        "size": np.tile([4.5, 2.0, 1.5], (n, 1)),
-        "yaw": np.linspace(-3, 3, n),
-        "track_id": np.arange(n) + 7,
-    }
-    return Boxes(**{**columns, **changes})
+from .sample_boxes import boxes
 
 
 def message(**changes: Any) -> ObjectMessage:

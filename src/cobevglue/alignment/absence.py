@@ -12,7 +12,8 @@ import math
 import numpy as np
 
 from cobevglue._kernels import kernel
-from cobevglue.alignment.evidence import VX, VY, X, Y
+from cobevglue.alignment.evidence import X, Y
+from cobevglue.alignment.pose_search import place_box
 
 __all__ = ["missing_counterparts"]
 
@@ -53,9 +54,7 @@ def missing_counterparts(ego, other, star, pairs) -> int:
     view_x, view_y, squared = _view(ego)
     for n in range(len(other)):
         if not other_matched[n]:
-            dx = other[n, X] - star.offset * other[n, VX] - star.other_x
-            dy = other[n, Y] - star.offset * other[n, VY] - star.other_y
-            x, y = star.ego_x + cos * dx - sin * dy, star.ego_y + sin * dx + cos * dy
+            _, _, x, y = place_box(star, cos, sin, other[n])
             missing += (x - view_x) ** 2 + (y - view_y) ** 2 < squared
     view_x, view_y, squared = _view(other)
     for m in range(len(ego)):

@@ -139,6 +139,29 @@ def _predict(h, dt: float, motion: Motion) -> None:
 
 
 @kernel(error_model="numpy")
+def _subtract_measured(cov, row, total, measures_offset) -> None:
+    """Covariance after a measurement of variance `total`, whose covariance with the state is `row` (7,).
+
+    Velocities are noisy, so positions and rates must not pull at the offset: unless it is what is measured, it is a
+    consider state (Schmidt-Kalman), whose variance stays.
+    """
+    for j in range(7):
+        for k in range(7):
+            if measures_offset or j < 6 or k < 6:
+                cov[j, k] -= row[j] / total * row[k]
+
+
+@kernel(error_model="numpy")
+def _change_pose(h, change) -> None:
+    """Add a change (6,) to pose and rate."""
+    h.ego_x += change[0]
+    h.ego_y += change[1]
+    h.yaw = wrap(h.yaw + change[2])
+    for j in range(3):
+        h.rate[j] += change[3 + j]
+
+
+@kernel(error_model="numpy")
 def _correct_turn_rate(h, turn_rate, variance) -> None:
     """Kalman update with the relative turn rate that the two frames' motions imply, unless it contradicts the pose's.
 
@@ -152,17 +175,12 @@ def _correct_turn_rate(h, turn_rate, variance) -> None:
     row = np.empty(7)
     for j in range(7):
         row[j] = h.cov[5, j]
-    for j in range(7):
-        for k in range(7):
-            if j < 6 or k < 6:  # the offset is a consider state here, too
-                h.cov[j, k] -= row[j] / total * row[k]
+    _subtract_measured(h.cov, row, total, False)
     _symmetrise(h.cov)
-    gain = innovation / total
-    h.ego_x += gain * row[0]
-    h.ego_y += gain * row[1]
-    h.yaw = wrap(h.yaw + gain * row[2])
-    for j in range(3):
-        h.rate[j] += gain * row[3 + j]
+    change = np.empty(6)
+    for j in range(6):
+        change[j] = innovation / total * row[j]
+    _change_pose(h, change)
 
 
 @kernel(error_model="numpy")
@@ -226,18 +244,11 @@ def _correct(h, star, correlation) -> None:
             row[j] = cov[state, j] + per_offset[i] * cov[6, j]
         total = row[state] + per_offset[i] * row[6] + variance[i]
         for j in range(7):
-            # Velocities are noisy, so positions must not pull at the offset: it is a consider state (Schmidt-Kalman).
-            gain = row[j] / total if i == 3 or j < 6 else 0.0
-            change[j] += gain * left
-            for k in range(7):
-                if i == 3 or j < 6 or k < 6:
-                    cov[j, k] -= row[j] / total * row[k]
+            if i == 3 or j < 6:
+                change[j] += row[j] / total * left
+        _subtract_measured(cov, row, total, i == 3)
     _symmetrise(cov)
-    h.ego_x += change[0]
-    h.ego_y += change[1]
-    h.yaw = wrap(h.yaw + change[2])
-    for j in range(3):
-        h.rate[j] += change[3 + j]
+    _change_pose(h, change)
     h.offset += change[6]
 
 

@@ -34,6 +34,7 @@ __all__ = [
     "fit_pose",
     "match_boxes",
     "most_pairs",
+    "place_box",
     "refine",
     "same_pose",
     "search",
@@ -97,6 +98,24 @@ def most_pairs(ego: FloatArray, other: FloatArray, noise: NoiseModel) -> int:
 
 
 @kernel(error_model="numpy")
+def place_box(star, cos, sin, box):
+    """Where a star's pose and time offset put one of other's boxes.
+
+    Args:
+        star: a `STAR` record.
+        cos: of its yaw.
+        sin: of its yaw.
+        box: (7,) with velocity.
+
+    Returns:
+        x and y from the pivot along the axes of other's frame, and in ego's frame [m].
+    """
+    dx = box[X] - star.offset * box[VX] - star.other_x
+    dy = box[Y] - star.offset * box[VY] - star.other_y
+    return dx, dy, star.ego_x + cos * dx - sin * dy, star.ego_y + sin * dx + cos * dy
+
+
+@kernel(error_model="numpy")
 def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     """Find the pairs that agree with a star's pose, one-to-one, best evidence first.
 
@@ -117,9 +136,7 @@ def match_boxes(ego, other, sizes, star, pairs, noise) -> None:
     row = np.empty((len(gain), 2), np.int64)
     found = 0
     for n in range(n_count):
-        dx = other[n, X] - star.offset * other[n, VX] - star.other_x
-        dy = other[n, Y] - star.offset * other[n, VY] - star.other_y
-        x, y = star.ego_x + cos * dx - sin * dy, star.ego_y + sin * dx + cos * dy
+        dx, dy, x, y = place_box(star, cos, sin, other[n])
         ux, uy = other[n, VX] - star.other_vx, other[n, VY] - star.other_vy
         vx, vy = cos * ux - sin * uy, sin * ux + cos * uy
         variance = noise.position_std**2 + star.position_variance

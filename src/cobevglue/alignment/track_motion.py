@@ -63,6 +63,33 @@ class TrackNoise(NamedTuple):
 
 
 @kernel(error_model="numpy")
+def _add_point(hessian, pull, x, y, ex, ey, weight) -> None:
+    """Add a point at (x, y) with residual (ex, ey) to the normal equations of a planar rigid motion.
+
+    Only the upper triangle of the (3, 3) hessian is filled.
+    """
+    hessian[0, 0] += weight
+    hessian[1, 1] += weight
+    hessian[0, 2] -= weight * y
+    hessian[1, 2] += weight * x
+    hessian[2, 2] += weight * (x * x + y * y)
+    pull[0] += weight * ex
+    pull[1] += weight * ey
+    pull[2] += weight * (x * ey - y * ex)
+
+
+@kernel(error_model="numpy")
+def _gauss_newton_step(motion, hessian, pull):
+    """Move `motion` (3,) by the solution of the normal equations, and return its (3, 3) covariance."""
+    hessian[2, 0], hessian[2, 1] = hessian[0, 2], hessian[1, 2]
+    left = np.linalg.inv(hessian)
+    for i in range(3):
+        for j in range(3):
+            motion[i] += left[i, j] * pull[j]
+    return left
+
+
+@kernel(error_model="numpy")
 def _fit_frame_motion(before, now, variance, expected, prior, count):
     """The rigid motion (x, y, yaw) that most of `count` points share: Gauss-Newton with a Cauchy weight and a prior.
 
@@ -88,19 +115,8 @@ def _fit_frame_motion(before, now, variance, expected, prior, count):
             x, y = cos * before[i, 0] - sin * before[i, 1], sin * before[i, 0] + cos * before[i, 1]
             ex, ey = now[i, 0] - x - motion[0], now[i, 1] - y - motion[1]
             weight = 1.0 / (variance[i] + ex * ex + ey * ey)
-            hessian[0, 0] += weight
-            hessian[1, 1] += weight
-            hessian[0, 2] -= weight * y
-            hessian[1, 2] += weight * x
-            hessian[2, 2] += weight * (x * x + y * y)
-            pull[0] += weight * ex
-            pull[1] += weight * ey
-            pull[2] += weight * (x * ey - y * ex)
-        hessian[2, 0], hessian[2, 1] = hessian[0, 2], hessian[1, 2]
-        left = np.linalg.inv(hessian)
-        for i in range(3):
-            for j in range(3):
-                motion[i] += left[i, j] * pull[j]
+            _add_point(hessian, pull, x, y, ex, ey, weight)
+        left = _gauss_newton_step(motion, hessian, pull)
     return motion, np.array([left[0, 0], left[1, 1], left[2, 2]])
 
 
@@ -134,19 +150,8 @@ def _fit_common_motion(tracks, count):
             variance = tracks[t].velocity_variance
             weight = 1.0 / (1.0 + (ex * ex + ey * ey) / (scale * variance))
             weight *= weight / variance
-            hessian[0, 0] += weight
-            hessian[1, 1] += weight
-            hessian[0, 2] -= weight * y
-            hessian[1, 2] += weight * x
-            hessian[2, 2] += weight * (x * x + y * y)
-            pull[0] += weight * ex
-            pull[1] += weight * ey
-            pull[2] += weight * (x * ey - y * ex)
-        hessian[2, 0], hessian[2, 1] = hessian[0, 2], hessian[1, 2]
-        left = np.linalg.inv(hessian)
-        for i in range(3):
-            for j in range(3):
-                motion[i] += left[i, j] * pull[j]
+            _add_point(hessian, pull, x, y, ex, ey, weight)
+        _gauss_newton_step(motion, hessian, pull)
         if scale <= _NARROWEST_SCALE:
             return motion
         scale *= 0.5

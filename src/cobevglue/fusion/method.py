@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -54,9 +54,7 @@ class Received:
             return still
         gap = np.linalg.norm(boxes.center[:, None, :2] - self.aligned.center[None, :, :2], axis=-1)
         nearest = gap.argmin(axis=1)
-        center = boxes.center.copy()
-        center[:, :2] -= self.alignment.time_offset * velocity[nearest]
-        moved = boxes.replace(center=center).transform(self.alignment.ego_SE2_other)
+        moved = replace(self.alignment, other_velocity=velocity[nearest]).boxes_at_ego_instant(boxes)
         tracked = gap[np.arange(len(boxes)), nearest] < _SAME_BOX
         return still.replace(
             center=np.where(tracked[:, None], moved.center, still.center), yaw=np.where(tracked, moved.yaw, still.yaw)
