@@ -168,7 +168,7 @@ def _correct_turn_rate(h, turn_rate, variance) -> None:
     The velocities of the frames are not used: where most of what an agent sees drives along with it, the two agents
     may take different things for the ground.
     """
-    total = h.cov[5, 5] + variance
+    total = h.cov[5, 5] + variance + (_UNSEEN_TURN_ACCELERATION * h.offset) ** 2
     innovation = turn_rate - h.rate[2]
     if innovation * innovation > _SAME_TURN_RATE * total:
         return
