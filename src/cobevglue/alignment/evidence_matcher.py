@@ -122,7 +122,7 @@ class EvidenceMatcher:
         claim = np.full((4, 3), np.inf)
         if prior is not None:
             claim[0], claim[1:] = (prior[0].x, prior[0].y, prior[0].yaw), prior[1]
-        self._hypotheses, margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
+        self._hypotheses, margin, frame_margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
             self._hypotheses,
             ego_rows,
             other_rows,
@@ -147,7 +147,7 @@ class EvidenceMatcher:
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0, risk=1.0)
         evidence = float(self._hypotheses[0]["evidence"])
-        verdict = judge(evidence, margin, landing_std, len(pairs), self._seen, config)
+        verdict = judge(evidence, margin, frame_margin, landing_std, len(pairs), self._seen, config)
         if verdict.reason and config.verdict:
             return Alignment.refused(verdict.reason, evidence, margin, verdict.risk)
         pose = SE2(x, y, yaw)

@@ -442,8 +442,8 @@ def advance(
         rounds: refits of each star.
 
     Returns:
-        The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the
-        standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
+        The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the same
+        of the evidence of this frame alone, infinite without a different pose; the standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
         of ego and other that it matches in this frame; its x, y and yaw at the instants of the two lists and the time
         offset, and the (4, 4) covariance of these four.
     """
@@ -549,12 +549,16 @@ def advance(
         if not same_pose(ranked[0], ranked[i], SAME_DISTANCE, SAME_ANGLE):
             margin = ranked[0].evidence - ranked[i].evidence
             break
+    frame_margin = np.inf
+    for j in range(total):
+        if not same_pose(ranked[0], kept[j], SAME_DISTANCE, SAME_ANGLE):
+            frame_margin = min(frame_margin, ranked[0].frame_evidence - kept[j].frame_evidence)
     matched = np.empty((ranked[0].pairs if 0 <= best_star < count else 0, 2), np.int64)
     if len(matched):
         copy_pairs(matched, rows[best_star], len(matched))
     if len(ranked) == 0:
-        return ranked, margin, np.inf, matched, 0.0, 0.0, 0.0, 0.0, np.zeros((4, 4))
+        return ranked, margin, frame_margin, np.inf, matched, 0.0, 0.0, 0.0, 0.0, np.zeros((4, 4))
     best_hypothesis = ranked[0]
     landing = _landing_std(best_hypothesis, other)
     x, y, yaw, covariance = _at_origin(best_hypothesis)
-    return ranked, margin, landing, matched, x, y, yaw, best_hypothesis.offset, covariance
+    return ranked, margin, frame_margin, landing, matched, x, y, yaw, best_hypothesis.offset, covariance
