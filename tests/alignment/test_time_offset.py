@@ -153,6 +153,18 @@ def test_new_track_id_begins_at_rest() -> None:
     np.testing.assert_allclose(velocity[:, 2], TrackNoise().speed ** 2)
 
 
+@pytest.mark.parametrize(("detections", "speed"), [(2, 0.0), (3, 35.0), (4, 35.0)])
+def test_velocity_takes_three_detections(detections: int, speed: float) -> None:
+    """Two detections 3.5 m apart are often two objects under one track id."""
+    motion = FrameMotion()
+    parked = vehicles(0.0)[SPEEDS == 0.0]
+    for k in range(10 + detections):
+        fast = Boxes([(3.5 * (k - 10), 6.0, 0.0)], [(4.5, 1.9, 1.6)], [0.0], track_id=[99])
+        boxes = Boxes.concatenate([parked, fast]) if k >= 10 else parked
+        velocity = motion.velocities(box_rows(boxes), track_ids(boxes), 0.1)
+    assert velocity[-1, 0] == pytest.approx(speed, abs=2.0)
+
+
 def test_rows_in_another_order_change_nothing() -> None:
     lists = [observed(t, world_SE2_other(t), 1) for t in 0.1 * np.arange(8)]
     order = np.random.default_rng(0).permutation(len(SPEEDS))
