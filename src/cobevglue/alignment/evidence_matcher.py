@@ -122,7 +122,7 @@ class EvidenceMatcher:
         claim = np.full((4, 3), np.inf)
         if prior is not None:
             claim[0], claim[1:] = (prior[0].x, prior[0].y, prior[0].yaw), prior[1]
-        self._hypotheses, margin, frame_margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
+        found = self._kernels.advance(
             self._hypotheses,
             ego_rows,
             other_rows,
@@ -142,6 +142,7 @@ class EvidenceMatcher:
             config.tries,
             self._rounds,
         )
+        self._hypotheses, margin, frame_margin, landing_std, pairs, x, y, yaw, offset, covariance = found
         self._seen += 1
         self._expected_offset = expected_offset
         if not len(self._hypotheses):

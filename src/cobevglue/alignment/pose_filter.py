@@ -443,9 +443,10 @@ def advance(
 
     Returns:
         The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the same
-        of the evidence of this frame alone, infinite without a different pose; the standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
-        of ego and other that it matches in this frame; its x, y and yaw at the instants of the two lists and the time
-        offset, and the (4, 4) covariance of these four.
+        of the evidence of this frame alone, infinite without a different pose; the standard deviation with which the
+        best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows of ego and other that it matches
+        in this frame; its x, y and yaw at the ego's instant and the time offset, and the (4, 4) covariance of these
+        four.
     """
     steps = dt / _STEP
     memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
