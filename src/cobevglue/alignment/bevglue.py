@@ -60,7 +60,8 @@ class BEVGlue:
         """The relative pose in this frame, or a refusal with its reason.
 
         An agent's own vehicle is an object to the other agent, which no detector of its own reports. Where it is given,
-        it takes part like any box, and a pose that places one vehicle into the other is refused.
+        it takes part like any box, and a pose that places one vehicle into the other is refused. The paper's method uses
+        none of the keyword arguments.
 
         Args:
             ego: boxes in ego's frame, with track ids if there are any.
@@ -92,9 +93,8 @@ class BEVGlue:
         claimed = None if prior is None else (prior[0], _checked_covariance(prior[1]))
         times = self._advance_clocks(time, other_time)
         if isinstance(self._matcher, PaperMatcher):
-            alignment = self._matcher.align(*with_bodies)
-        else:
-            alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
+            return self._matcher.align(ego, other)
+        alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
         return check_bodies(alignment, ego, other, ego_body, other_body)
 
     @property
