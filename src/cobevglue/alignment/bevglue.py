@@ -60,8 +60,8 @@ class BEVGlue:
         """The relative pose in this frame, or a refusal with its reason.
 
         An agent's own vehicle is an object to the other agent, which no detector of its own reports. Where it is given,
-        it takes part like any box, and a pose that places one vehicle into the other is refused. The paper's method uses
-        none of the keyword arguments.
+        it takes part like any box, and a pose that places one vehicle into the other is refused. The paper's method
+        uses none of the keyword arguments.
 
         Args:
             ego: boxes in ego's frame, with track ids if there are any.
@@ -75,7 +75,8 @@ class BEVGlue:
                 It is one more pose to try and counts as little evidence, so that a false claim does no harm.
 
         The list of the collaborator may be of another instant: the offset is estimated from the velocities of its
-        tracks, and the pose is that at the ego's instant. With `BEVGlueConfig(time_offset=False)` the two lists are
+        tracks, and the pose is that at the ego's instant: the collaborator's frame is moved on if it moves like a
+        vehicle or comes with `other_body`, and is otherwise, as a map's frame, the same at both instants. With `BEVGlueConfig(time_offset=False)` the two lists are
         taken to be of one instant.
 
         Returns:

@@ -107,9 +107,7 @@ class _Run:
             self._system.aligner.reset()
         poses = frame.true if self.condition.true_poses else frame.claimed
         self._memo.saved = 0.0
-        out = self._system.collaborate(
-            frame.observations, observed.ego, frame.time, poses, bodies=frame.own_vehicles
-        )
+        out = self._system.collaborate(frame.observations, observed.ego, frame.time, poses, bodies=frame.own_vehicles)
         out.seconds["messages"] += self._memo.saved
         received = tuple(_received_poses(frame, observed.ego, out))
         self.frames[index] = FrameResult(_without_labels(out.boxes), received, out.seconds)
