@@ -75,9 +75,9 @@ class BEVGlue:
                 It is one more pose to try and counts as little evidence, so that a false claim does no harm.
 
         The list of the collaborator may be of another instant: the offset is estimated from the velocities of its
-        tracks, and the pose is that at the ego's instant: the collaborator's frame is moved on if it moves like a
-        vehicle or comes with `other_body`, and is otherwise, as a map's frame, the same at both instants. With `BEVGlueConfig(time_offset=False)` the two lists are
-        taken to be of one instant.
+        tracks, and the pose is that at the ego's instant. The collaborator's frame is moved on if it moves like a
+        vehicle or comes with `other_body`; any other frame, such as a map's, is the same at both instants. With
+        `BEVGlueConfig(time_offset=False)` the two lists are taken to be of one instant.
 
         Returns:
             The pose with the matches of `ego` and `other`; matches of own vehicles are not listed.

@@ -173,9 +173,9 @@ class EvidenceMatcher:
         )
 
     def _change_instant(self) -> None:
-        """Move the hypotheses to the other list's instant, or back, when other's frame is a vehicle's no more, or is one.
+        """Move the hypotheses to the other list's instant, or back, when other's frame becomes or ceases to be a vehicle's.
 
-        The frame of a vehicle is another one at the ego's instant; any other frame is the same.
+        A vehicle's frame is another one at the ego's instant; any other frame is the same.
         """
         motion = self._other_motion
         for h in self._hypotheses:
