@@ -173,7 +173,7 @@ class EvidenceMatcher:
         )
 
     def _change_instant(self) -> None:
-        """Move the hypotheses to the other list's instant, or back, when other's frame becomes or ceases to be a vehicle's.
+        """Move the hypotheses to the other list's instant, or back, when its frame becomes or ceases to be a vehicle's.
 
         A vehicle's frame is another one at the ego's instant; any other frame is the same.
         """
