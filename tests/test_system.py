@@ -141,7 +141,7 @@ def test_output_headings_follow_transmitted_headings(frames: RealFrames, compact
 
 def test_feature_message_is_three_float16_maps() -> None:
     detector = small_detector()
-    system = CoBEVGlue(detector, method("cobevglue", detector), Fixed({"b": SE2()}))
+    system = CoBEVGlue(detector, method("cobevglue-features", detector), Fixed({"b": SE2()}))
     out = system.step({"a": cloud(1), "b": cloud(2)}, "a")
     numbers = 8 * (16 * 32 + 8 * 16 + 4 * 8)
     assert out.message_bytes["b"]["features"] == 2 * numbers + 6 + 4 + 3 * (1 + 4 + 2 + 12)

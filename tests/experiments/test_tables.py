@@ -91,10 +91,7 @@ def test_paper_figures_appear_on_its_data_sets(results: Results, dataset: str) -
 def test_table_2_is_without_and_with_bevglue(results: Results) -> None:
     made = table(results, "attack", "attack")
     titles = [row[0] for row in made.rows]
-    assert titles == [method_title(n) for n in FUSION_METHODS if n not in ("none", "cobevglue")] + [
-        "CoBEVGlue",
-        "No collaboration",
-    ]
+    assert titles == [method_title(n) for n in FUSION_METHODS if n != "none"] + ["No collaboration"]
     assert column(made, "AP@0.5 with")["F-Cooper"] == results.ap(attacked("f-cooper", "bevglue"), 0.5)
     assert column(made, "AP@0.7 without")["F-Cooper"] == results.ap(attacked("f-cooper"), 0.7)
     added = column(made, "added bytes [%]")["F-Cooper"]
@@ -219,5 +216,5 @@ def test_paper_has_its_own_claims() -> None:
     for methods in paper.NOISE.values():
         for name, published in methods.items():
             assert all(len(values) == 4 for values in published.values())
-            if name != "cobevglue":
-                assert all(value < methods["cobevglue"][0.5][0] for value in published[0.5][2:])
+            if name != "cobevglue-features":
+                assert all(value < methods["cobevglue-features"][0.5][0] for value in published[0.5][2:])

@@ -53,9 +53,9 @@ def test_collaborators_matter(name: str) -> None:
     assert len(alone) != len(together) or np.abs(alone.bev - together.bev)[:n].max() > 1e-3
 
 
-@pytest.mark.parametrize("name", [n for n in LEARNED if n not in {"coalign", "fpv-rcnn"}])
+@pytest.mark.parametrize("name", [n for n in LEARNED if n not in {"coalign", "fpv-rcnn", "cobevglue"}])
 def test_agent_without_coverage_changes_nothing(name: str) -> None:
-    """But for CoAlign, whose attention counts empty cells, and FPV-RCNN, which takes over boxes from everywhere."""
+    """Except CoAlign's, whose attention counts empty cells, and methods that take over boxes from everywhere."""
     method = made(name)
     ego, near, far = (checks.view(DETECTOR, seed) for seed in range(3))
     heard = [checks.sent(method, near, checks.POSES[0])]

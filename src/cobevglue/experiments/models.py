@@ -12,7 +12,7 @@ from cobevglue.alignment import BEVGlueConfig, group_aligner
 from cobevglue.alignment.group import GroupAligner
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.study import StudySettings
-from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion
+from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion, weights_name
 from cobevglue.perception import PointPillars
 from cobevglue.perception.checkpoint import fingerprint
 from cobevglue.torch_device import chosen_device
@@ -78,7 +78,7 @@ class Models:
             torch.manual_seed(settings.seed)
             method = fusion_class(name)(self.detector)
         if isinstance(method, IntermediateFusion) and settings.weights is not None:
-            method.load(Path(settings.weights) / f"{name}.safetensors")
+            method.load(Path(settings.weights) / f"{weights_name(name)}.safetensors")
         return method
 
     def aligner(self, condition: Condition) -> GroupAligner:

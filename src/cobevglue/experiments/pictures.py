@@ -72,7 +72,7 @@ def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> lis
     ego, frame, truth = sequence.ego, sequence.frames[-1], sequence.truth[-1]
     counted = inside(truth.objects, models.evaluation_range) & (truth.point_count >= settings.min_points)
     objects = truth.objects[counted]
-    (ours,) = scope.localised
+    ours = scope.ours
     pictures = []
     for name in _SHOWN:
         if name in scope.methods:

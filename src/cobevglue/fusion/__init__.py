@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.fusion.coalign import CoAlign
-from cobevglue.fusion.cobevglue import MaxFusion
+from cobevglue.fusion.cobevglue import MaxFusion, MaxFusionWithBoxes
 from cobevglue.fusion.disconet import DiscoNet
 from cobevglue.fusion.early import EarlyFusion
 from cobevglue.fusion.f_cooper import FCooper
@@ -31,6 +31,7 @@ __all__ = [
     "SingleMapFusion",
     "fusion_class",
     "pretrained_fusion",
+    "weights_name",
 ]
 
 FUSION_METHODS: dict[str, type[FusionMethod]] = {
@@ -45,9 +46,13 @@ FUSION_METHODS: dict[str, type[FusionMethod]] = {
     "v2vnet-robust": V2VNetRobust,
     "v2x-vit": V2XViT,
     "coalign": CoAlign,
-    "cobevglue": MaxFusion,
+    "cobevglue-features": MaxFusion,
+    "cobevglue": MaxFusionWithBoxes,
 }
-"""From the name users type to the class, in the order of the paper's Table 1."""
+"""From the name users type to the class, in the order of the paper's Table 1, the last two of which are its one row."""
+
+_SHARED_WEIGHTS = {"cobevglue-features": "cobevglue"}
+"""Methods that use the weights of another one."""
 
 _WEIGHTS = Path(__file__).parent / "weights"
 
@@ -63,6 +68,11 @@ def fusion_class(name: str) -> type[FusionMethod]:
     return FUSION_METHODS[name]
 
 
+def weights_name(name: str) -> str:
+    """The name of the method whose weights a method uses, in most cases its own."""
+    return _SHARED_WEIGHTS.get(name, name)
+
+
 def pretrained_fusion(name: str, detector: PointPillars, detector_name: str) -> FusionMethod:
     """A method, with the weights that come with the package where it has any.
 
@@ -76,7 +86,7 @@ def pretrained_fusion(name: str, detector: PointPillars, detector_name: str) -> 
     """
     method = fusion_class(name)(detector)
     if isinstance(method, IntermediateFusion):
-        path = _WEIGHTS / f"{detector_name}_{name}.safetensors"
+        path = _WEIGHTS / f"{detector_name}_{weights_name(name)}.safetensors"
         if not path.is_file():
             raise ValueError(f"no pretrained weights of {name!r} for the detector {detector_name!r}")
         method.load(path)

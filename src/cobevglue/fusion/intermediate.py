@@ -168,7 +168,8 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     def received_maps(self, content: Arrays) -> list[Tensor]:
         """The maps (C, H, W) of a message."""
-        return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(len(content))]
+        number = sum(name.startswith("map") for name in content)
+        return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(number)]
 
     @torch.inference_mode()
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:

@@ -11,12 +11,13 @@ from cobevglue.fusion.method import FusionMethod, Received
 from cobevglue.iou import nms
 from cobevglue.messages import Arrays
 from cobevglue.perception import PerceptionOutput, PointPillars
+from cobevglue.typing import Float32Array
 
-__all__ = ["LateFusion"]
+__all__ = ["LateFusion", "detection_rows", "received_detections"]
 
 
 class LateFusion(FusionMethod):
-    """All agents' boxes in the ego's frame, and of those that overlap the one with the best score."""
+    """All agents' boxes in the ego frame, and of those that overlap the one with the best score."""
 
     kind = "boxes"
 
@@ -24,18 +25,23 @@ class LateFusion(FusionMethod):
         self.detection = detector.detection
 
     def message(self, observation: PerceptionOutput) -> Arrays:
-        """(K, 8) float32: x, y, z, l, w, h [m], yaw [rad] in the sender's LiDAR frame, and score."""
-        boxes = observation.detections
-        assert boxes.score is not None
-        rows = np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.score])
-        return {"detections": rows.astype(np.float32)}
+        """The agent's detections."""
+        return {"detections": detection_rows(observation)}
 
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
-        """Everyone's boxes after non-maximum suppression, best first."""
-        parts = [ego.detections.replace(label=None)]
-        for other in received:
-            rows = other.content["detections"].astype(np.float64)
-            boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7])
-            parts.append(other.boxes_at_ego_instant(boxes))
-        boxes = Boxes.concatenate(parts)
+        """All agents' boxes after non-maximum suppression, best first."""
+        boxes = Boxes.concatenate([ego.detections.replace(label=None), *map(received_detections, received)])
         return boxes[nms(boxes, self.detection.nms_iou)] if len(boxes) else boxes
+
+
+def detection_rows(observation: PerceptionOutput) -> Float32Array:
+    """(K, 8) x, y, z, l, w, h [m], yaw [rad] in the agent's LiDAR frame, and score, of its detections."""
+    boxes = observation.detections
+    assert boxes.score is not None
+    return np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.score]).astype(np.float32)
+
+
+def received_detections(other: Received) -> Boxes:
+    """The `detections` of a message, in the ego frame at the ego's instant."""
+    rows = other.content["detections"].astype(np.float64)
+    return other.boxes_at_ego_instant(Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7]))

@@ -16,7 +16,7 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from cobevglue.evaluation.detection import DetectionFrame, evaluate_detections
-from cobevglue.fusion import FUSION_METHODS, FusionSample, IntermediateFusion, fusion_class
+from cobevglue.fusion import FUSION_METHODS, FusionSample, IntermediateFusion, fusion_class, weights_name
 from cobevglue.fusion.disconet import DiscoNet, EarlyTeacher
 from cobevglue.perception import AnchorGrid, DetectionLoss, PointPillars, Targets, assign_targets, collate_targets
 from cobevglue.se2 import SE2
@@ -276,7 +276,7 @@ FUSION_PRESETS: dict[str, TrainFusionConfig] = {
         optimisation=_DEFAULT.model_copy(update={"learning_rate": 1e-3} if name in _SLOWER else {}),
     )
     for name, method in FUSION_METHODS.items()
-    if issubclass(method, IntermediateFusion)
+    if issubclass(method, IntermediateFusion) and weights_name(name) == name
 }
 FUSION_PRESETS[TEACHER] = TrainFusionConfig(method=TEACHER)
 FUSION_PRESETS["disconet"] = TrainFusionConfig(

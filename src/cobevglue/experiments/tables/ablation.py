@@ -17,7 +17,7 @@ _ANY_EDGE = {"affinity": {"position_scale": 1e6, "heading_scale": 1e6}}
 
 def _rows(scope: Scope) -> dict[tuple[str, bool, bool], Condition]:
     """By variant, and whether geometry and tracking are used."""
-    name = scope.localised[0]
+    name = scope.ours
     printed, alone = "as printed", {"temporal": False, "tracks": False}
     return {
         (printed, False, False): as_is(name, aligner_options={**_PRINTED, **_ANY_EDGE}, forget=True),

@@ -54,7 +54,7 @@ def _time(scope: Scope, results: Results, dataset: str) -> list[Table]:
         times = [spent.get(stage) for stage in stages]
         rows.append([method_title(name), aligner_title(FUSION_METHODS[name].usual_aligner), *times])
     notes = ["Medians over frames of all collaborators together, on one core, with other processes on the others."]
-    alignment = results.milliseconds(as_is(scope.localised[0])).get("alignment")
+    alignment = results.milliseconds(as_is(scope.ours)).get("alignment")
     if alignment:
         theirs = paper.FRAMES_PER_SECOND.get(dataset)
         published = f"; the paper has {theirs} on its machine" if theirs else ""

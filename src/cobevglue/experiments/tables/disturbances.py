@@ -29,7 +29,7 @@ _FURTHER: dict[str, dict[str, Any]] = {
 
 def _rows(scope: Scope) -> dict[str, dict[str, Any]]:
     """By title, the method and its aligner: CoBEVGlue, its fusion on given poses, boxes on given poses, CoAlign."""
-    (ours,) = scope.localised
+    ours = scope.ours
     rows: dict[str, dict[str, Any]] = {
         method_title(ours): {"fusion": ours},
         "Given pose, CoBEVGlue's fusion": {"fusion": ours, "aligner": "given"},
@@ -63,7 +63,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         title = f"AP@{iou:g} under further disturbances"
         notes = (f"On one frame in {every}; CoBEVGlue, who remembers, is run on those between, too.",)
         tables.append(Table(f"disturbances_ap{iou:g}", title, ("what goes wrong", *_rows(scope)), rows, notes))
-    (ours,) = scope.localised
+    ours = scope.ours
     rows = []
     for title, what in _FURTHER.items():
         condition = _condition(scope, {"fusion": ours}, what)

@@ -22,10 +22,9 @@ def _rows(scope: Scope) -> dict[tuple[str, str, str], list[Condition]]:
         # Who listens to nobody is the same at every level.
         levels = [0.0] * len(scope.levels) if name == "none" else scope.levels
         rows[method_title(name), source, name] = [as_is(name, level) for level in levels]
-    for name in scope.localised:
-        rows[_GIVEN, "given pose", ""] = [as_is(name, level, "given") for level in scope.levels]
-        # With true poses noise makes no difference, as a test shows: run once.
-        rows[_TRUE, "true pose", ""] = [as_is(name, 0.0, "given")] * len(scope.levels)
+    rows[_GIVEN, "given pose", ""] = [as_is(scope.ours, level, "given") for level in scope.levels]
+    # With true poses noise makes no difference, as a test shows: run once.
+    rows[_TRUE, "true pose", ""] = [as_is(scope.ours, 0.0, "given")] * len(scope.levels)
     return rows
 
 

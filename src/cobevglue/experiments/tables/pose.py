@@ -43,7 +43,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
             poses = [pose for _, pose in results.received_poses(as_is(name, level))]
             rows.append([aligner_title(aligner), level_name(level), *_cells(poses)])
     columns = ("poses from", "noise", *_COLUMNS)
-    pairs = list(results.received_poses(as_is(scope.localised[0])))
+    pairs = list(results.received_poses(as_is(scope.ours)))
     groups: list[list[Cell]] = []
     for group, (first, last) in _GROUPS.items():
         poses = [pose for co_visible, pose in pairs if first <= co_visible <= last]

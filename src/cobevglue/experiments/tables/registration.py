@@ -25,7 +25,7 @@ def _rows(scope: Scope) -> dict[tuple[str, str], Condition]:
                     aligner_title(aligner) if level is None else f"{aligner_title(aligner)}, initial pose ±{level:g}"
                 )
                 rows[label, f"{budget}"] = as_is(
-                    scope.localised[0],
+                    scope.ours,
                     level or 0.0,
                     aligner,
                     aligner_options={"budget_bytes": budget},
@@ -35,13 +35,13 @@ def _rows(scope: Scope) -> dict[tuple[str, str], Condition]:
 
 
 def _conditions(scope: Scope) -> list[Condition]:
-    return [as_is("none"), as_is(scope.localised[0]), as_is(scope.localised[0], 0.0, "given"), *_rows(scope).values()]
+    return [as_is("none"), as_is(scope.ours), as_is(scope.ours, 0.0, "given"), *_rows(scope).values()]
 
 
 def _all_rows(scope: Scope) -> dict[tuple[str, str], Condition]:
-    bevglue = {("BEVGlue", ""): as_is(scope.localised[0])}
+    bevglue = {("BEVGlue", ""): as_is(scope.ours)}
     alone = {(method_title("none"), ""): as_is("none")}
-    return {**bevglue, **_rows(scope), **alone, ("True pose", ""): as_is(scope.localised[0], 0.0, "given")}
+    return {**bevglue, **_rows(scope), **alone, ("True pose", ""): as_is(scope.ours, 0.0, "given")}
 
 
 def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:

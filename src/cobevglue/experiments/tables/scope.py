@@ -39,6 +39,7 @@ _METHOD_TITLES = {
     "v2vnet-robust": "V2VNet-robust",
     "v2x-vit": "V2X-ViT",
     "coalign": "CoAlign",
+    "cobevglue-features": "CoBEVGlue, features only",
     "cobevglue": "CoBEVGlue",
 }
 _ALIGNER_TITLES = {
@@ -52,7 +53,7 @@ _ALIGNER_TITLES = {
     "fpfh-teaser": "FPFH + TEASER",
 }
 
-_ALWAYS = ("none", "cobevglue")
+_ALWAYS = ("none", "cobevglue-features", "cobevglue")
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,13 @@ class Scope:
 
     @property
     def localised(self) -> list[str]:
-        """The methods that need no pose: CoBEVGlue."""
+        """The methods that need no pose: CoBEVGlue's two."""
         return [name for name in self.methods if FUSION_METHODS[name].usual_aligner == "bevglue"]
+
+    @property
+    def ours(self) -> str:
+        """The method of the tables on one method: CoBEVGlue as it is by default."""
+        return "cobevglue"
 
     @property
     def registrations(self) -> list[str]:

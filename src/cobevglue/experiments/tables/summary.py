@@ -19,7 +19,7 @@ def summary(scope: Scope, parts: Mapping[str, Results]) -> Table:
         scope: of the study.
         parts: the results by the name of their data.
     """
-    (ours,) = scope.localised
+    ours = scope.ours
     worst = scope.levels[-1]
     asked: dict[str, Condition] = {
         "no collaboration": as_is("none"),
