@@ -68,6 +68,13 @@ class ObjectCollaboration:
         self._trackers: dict[str, Sort] = {}
         self._latest: dict[str, tuple[float, Boxes]] = {}
 
+    def forget(self, agent: str) -> None:
+        """Forget the tracks and the pose of one agent: its next list does not continue its last one."""
+        self.aligner.forget(agent)
+        self._latest.pop(agent, None)
+        if agent in self._trackers:
+            self._trackers[agent].reset()
+
     def step(
         self,
         objects: Mapping[str, Boxes],
