@@ -12,6 +12,7 @@ import numpy as np
 
 from cobevglue.boxes import Boxes
 from cobevglue.recordings.message_definitions import DETECTIONS
+from cobevglue.typing import FloatArray
 
 __all__ = ["DetectionBag", "new_detection_bag"]
 
@@ -47,7 +48,7 @@ class DetectionBag:
         )
         detections = []
         for row in range(len(boxes)):
-            pose = self._pose(*boxes.center[row].tolist(), float(boxes.yaw[row]))
+            pose = self._pose(boxes.center[row], float(boxes.yaw[row]))
             size = self._make("geometry_msgs", "Vector3", *boxes.size[row].tolist())
             label = "" if boxes.label is None else str(boxes.label[row])
             score = 1.0 if boxes.score is None else float(boxes.score[row])
@@ -62,9 +63,10 @@ class DetectionBag:
             detections.append(self._make("vision_msgs", "Detection3D", header, [hypothesis], box, identity))
         return self._make("vision_msgs", "Detection3DArray", header, detections)
 
-    def _pose(self, x: float, y: float, z: float, yaw: float) -> Any:
+    def _pose(self, center: FloatArray, yaw: float) -> Any:
+        position = self._make("geometry_msgs", "Point", *center.tolist())
         orientation = self._make("geometry_msgs", "Quaternion", 0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
-        return self._make("geometry_msgs", "Pose", self._make("geometry_msgs", "Point", x, y, z), orientation)
+        return self._make("geometry_msgs", "Pose", position, orientation)
 
     def _make(self, package: str, name: str, *values: Any) -> Any:
         return self._store.types[f"{package}/msg/{name}"](*values)
