@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cobevglue.datasets.frame import did_you_mean
 from cobevglue.recordings.message_definitions import LAYOUTS
 
 __all__ = ["Recording", "Topic", "open_recording"]
@@ -57,17 +56,6 @@ class Recording:
         }
         self._reader = reader
         self._decoders: dict[str, Callable[[bytes], Any]] = {}
-
-    def topic(self, name: str) -> Topic:
-        """The topic of this name; the leading slash may be left out.
-
-        Raises:
-            ValueError: there is none; names those there.
-        """
-        for candidate in (name, f"/{name}"):
-            if candidate in self.topics:
-                return self.topics[candidate]
-        raise ValueError(f"{self.path}: there is no topic {did_you_mean(name, self.topics)}")
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, float, Any]]:
         """The messages of these topics in the order in which they were received.

@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import RawIOBase
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -137,7 +138,7 @@ def open_foxglove_file(path: str | Path, ego: str) -> Iterator[FoxgloveFile]:
         raise ModuleNotFoundError(
             f"MCAP files need foxglove-sdk: pip install 'cobevglue[ros]' ({error})", name="foxglove"
         ) from None
-    with open(path, "wb") as file:
+    with Path(path).open("wb", buffering=0) as file:
         target = _Target(file)
         context = foxglove.Context()
         writer = foxglove.open_mcap(target, context=context)
@@ -145,25 +146,24 @@ def open_foxglove_file(path: str | Path, ego: str) -> Iterator[FoxgloveFile]:
             yield FoxgloveFile(foxglove, context, target, ego)
         finally:
             writer.close()
-        target.flush()
         target.check()
 
 
 class _Target:
-    """The file that foxglove-sdk writes to. It keeps errors of writing, which the SDK would only log."""
+    """The file that foxglove-sdk writes to. It keeps the first error of writing, which the SDK would only log."""
 
-    def __init__(self, file: IO[bytes]) -> None:
+    def __init__(self, file: RawIOBase) -> None:
         self._file = file
         self._error: OSError | None = None
 
     def check(self) -> None:
-        """Raise the error of the last write that failed."""
+        """Raise the error of writing, if there was one."""
         if self._error is not None:
             raise self._error
 
     def write(self, data: bytes | bytearray) -> int:
         try:
-            return self._file.write(data)
+            return self._file.write(data) or 0
         except OSError as error:
             self._error = self._error or error
             return len(data)
@@ -172,10 +172,7 @@ class _Target:
         return self._file.seek(offset, whence)
 
     def flush(self) -> None:
-        try:
-            self._file.flush()
-        except OSError as error:
-            self._error = self._error or error
+        """Nothing is buffered."""
 
 
 def _rgb(color: str) -> dict[str, float]:

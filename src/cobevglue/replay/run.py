@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cobevglue.replay.replay import Replay, ReplayFrame
@@ -41,6 +41,13 @@ def run_replay(
         OSError: a file cannot be written.
         ModuleNotFoundError: a module that writes a file is not installed.
     """
+    with _named_folder(out):
+        return _run(replay, out, rerun, progress)
+
+
+def _run(
+    replay: Replay, out: Path | None, rerun: bool, progress: Callable[[int, int], None] | None
+) -> tuple[Summary, list[Path]]:
     summary = Summary()
     shown: dict[int, ReplayFrame] = {}
     total = max(replay.topics[replay.ego].count, 1)
@@ -62,6 +69,17 @@ def run_replay(
 
     files = write_replay_report(replay, summary, list(shown.values()), out)
     return summary, [*files, out / MCAP, out / LINES, *([out / RERUN] if rerun else [])]
+
+
+@contextmanager
+def _named_folder(out: Path | None) -> Iterator[None]:
+    """Errors of writing that name no file, such as that of a full disk, name the folder."""
+    try:
+        yield
+    except OSError as error:
+        if out is None or error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(out)) from error
 
 
 def _writers(out: Path, ego: str, rerun: bool, stack: ExitStack) -> list[Callable[[ReplayFrame], None]]:

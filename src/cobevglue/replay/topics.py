@@ -49,10 +49,10 @@ def agent_topics(recording: Recording, ego: str | None = None, others: Sequence[
 
 
 def _usable(recording: Recording, name: str) -> Topic:
-    try:
-        topic = recording.topic(name)
-    except ValueError as error:
-        raise ValueError(f"{error}; {_listed(recording)}") from None
+    """The topic of this name, of which the leading slash may be left out."""
+    topic = recording.topics.get(name) or recording.topics.get(f"/{name}")
+    if topic is None:
+        raise ValueError(f"{recording.path}: there is no topic {name!r}; {_listed(recording)}")
     if topic.type not in OBJECTS + CLOUDS + MESSAGES:
         raise ValueError(f"{recording.path}: {topic.name} has {topic.type}, which has no objects; {_listed(recording)}")
     return topic
