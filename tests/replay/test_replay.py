@@ -21,7 +21,7 @@ from cobevglue.recordings import open_recording
 from cobevglue.replay import Replay, ReplayFrame
 from cobevglue.simulation.recording import STAGGER, write_recording
 
-from .bags import BYTES, DETECTION3DARRAY, POINTCLOUD2, UDP, Entry, detection, detections, header, write_bag
+from .bags import BYTES, DETECTION3DARRAY, POINTCLOUD2, UDP, Entry, detection, detections, header, pose, write_bag
 
 A, B = "/a/objects", "/b/objects"
 
@@ -122,9 +122,11 @@ def test_objects_without_size_are_counted(tmp_path: Path) -> None:
     [
         (detections(1.2, {"bbox": {"size": {"x": 1.0, "y": 1.0}}}), "detections: row 0: orientation must be a unit"),
         (detections(1.2, detection(np.nan, 0)), "detections: center: row 0 is not finite"),
+        (detections(1.2, detection(1, 0), detection(5.3e6, 0)), "center: row 1 has 5.3e.06 m, .* own frame"),
+        (detections(1.2, {"bbox": {"center": pose(1, 0), "size": {"x": 9e9, "y": 1.0}}}), "size: row 0 has 9e.09 m"),
         (detections(1.2, detection(1, 0), frame_id="car/map"), "frame_id: this is in the fixed frame 'car/map'"),
     ],
-    ids=["no orientation", "NaN", "a map"],
+    ids=["no orientation", "NaN", "coordinates of a map", "size", "a map"],
 )
 def test_bad_message_is_named(tmp_path: Path, message: dict[str, Any], words: str) -> None:
     bad = (B, DETECTION3DARRAY, 1.2, message)

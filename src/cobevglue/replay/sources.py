@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from cobevglue.boxes import Boxes
 from cobevglue.interop.ros import boxes_from_ros, points_from_ros, stamp_from_ros
 from cobevglue.messages import MessageError, ObjectMessage, decode
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Content", "Source", "make_source"]
 
 _FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm"})
+_FARTHEST, _LARGEST = 10_000.0, 1_000.0
+"""Of the objects that an agent can see: distance and size [m]; beyond, they are not in its frame, or damaged."""
 _CPM_PORT = (2009).to_bytes(2, "big")
 """Destination port of CPMs in the header of ETSI's basic transport protocol, which precedes them in packets."""
 _OBJECT_MESSAGE = b"CBVG"
@@ -72,6 +76,7 @@ class _Objects(Source):
 
     def content(self, message: Any, time: float) -> Content:
         found = boxes_from_ros(message, self._numbers)
+        _check_boxes(found.boxes)
         drops = self._numbers is not None and len(found.boxes) > 0 and found.boxes.track_id is None
         were_used = bool(self._numbers)
         if drops:
@@ -109,6 +114,7 @@ class _Messages(Source):
 
     def content(self, message: Any, time: float) -> Content:
         decoded = self._latest[1] if self._latest[0] is message else _decoded(bytes(bytearray(message.data)))
+        _check_boxes(decoded.boxes)
         return Content(decoded.boxes, decoded.body)
 
 
@@ -138,6 +144,15 @@ def _decoded(data: bytes) -> ObjectMessage:
         return cpm.decode(data).object_message()
     except MessageError as error:
         raise MessageError(f"neither a CPM nor a message of cobevglue: {error}") from None
+
+
+def _check_boxes(boxes: Boxes) -> None:
+    distance, size = np.abs(boxes.center).max(axis=1, initial=0.0), boxes.size.max(axis=1, initial=0.0)
+    for name, values, limit in (("center", distance, _FARTHEST), ("size", size, _LARGEST)):
+        if (values > limit).any():
+            row = int((values > limit).argmax())
+            hint = "; the list must be in the agent's own frame" if name == "center" else ""
+            raise ValueError(f"{name}: row {row} has {values[row]:.4g} m, at most {limit:g} m are possible{hint}")
 
 
 def _check_frame(message: Any) -> None:
