@@ -97,6 +97,12 @@ def test_every_kind_of_bag_is_read(tmp_path: Path, kind: str) -> None:
     assert [topic for topic, _, _ in read(path, "/b/objects")] == ["/b/objects"]
 
 
+@pytest.mark.parametrize("compressed", ["file", "message", "storage"])
+def test_compressed_bags_are_read(tmp_path: Path, compressed: str) -> None:
+    path = write_bag(tmp_path / "bag", TWO_TOPICS, sqlite=compressed != "storage", compressed=compressed)
+    assert [len(message.detections) for _, _, message in read(path)] == [1, 2, 0]
+
+
 def test_another_writer_and_reader_agree(tmp_path: Path) -> None:
     """What mcap-ros2-support writes is read here, and it reads what is written here."""
     pytest.importorskip("mcap_ros2", reason="the other reader and writer is mcap-ros2-support")

@@ -74,6 +74,7 @@ def replay(
         made.bodies = _bodies(body or [], made)
         for agent, topic in made.topics.items():
             print_note(f"{'ego' if agent == made.ego else 'other'}: {agent} ({topic.name}, {topic.count} messages)")
+        print_note("aligning (the first run compiles for half a minute) …")
         summary, files = run_replay(made, out, rerun=rerun, progress=_note)
     for stream in made.streams.values():
         for problem in stream.problems():

@@ -166,7 +166,5 @@ def _shipped_detector() -> PointPillars:
     try:
         from cobevglue.perception import PointPillars
     except ImportError as error:
-        raise ModuleNotFoundError(
-            f"point clouds need the detector: pip install 'cobevglue[perception]' ({error})", name="torch"
-        ) from None
+        raise ModuleNotFoundError(f"point clouds: {error}", name="torch") from None
     return PointPillars.pretrained("compact")
