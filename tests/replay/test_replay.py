@@ -233,8 +233,8 @@ def test_two_real_cars(tmp_path: Path, real_data: Path) -> None:
     with open_recording(tmp_path / "drive") as recording:
         frames = run(Replay(recording, "/ego/objects", ["/other/objects"]))
     found = [frame.seen.alignments["other"] for frame in frames]
-    near = [
-        np.hypot(each.ego_SE2_other.x - pair.ego_SE2_other.x, each.ego_SE2_other.y - pair.ego_SE2_other.y) < 2.0
+    near = [  # where the boxes of the other car come to lie
+        np.abs(each.ego_SE2_other.apply(pair.other.center) - pair.ego_SE2_other.apply(pair.other.center)).mean() < 1.5
         for each, pair in zip(found, pairs, strict=True)
         if each.ego_SE2_other is not None
     ]
