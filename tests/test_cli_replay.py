@@ -87,6 +87,8 @@ def test_problems_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         (["--body", "car9=4,2"], "--body: there is no agent 'car9'"),
         (["--body", "car1=4"], "--body: must be AGENT=LENGTH,WIDTH or"),
         (["--body", "car1=4,-2"], "--body: must be AGENT=LENGTH,WIDTH or"),
+        (["--frame", "car9=base_link"], "--frame: there is no agent 'car9'"),
+        (["--frame", "car1=lidar"], "message 1 (received at 1700000000.050 s): frame_id: this is in the frame 'car1'"),
         (["--rerun"], "--rerun: needs a folder (--out)"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

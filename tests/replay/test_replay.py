@@ -125,7 +125,10 @@ def test_objects_without_size_are_counted(tmp_path: Path) -> None:
         (detections(1.2, detection(np.nan, 0)), "detections: center: row 0 is not finite"),
         (detections(1.2, detection(1, 0), detection(5.3e6, 0)), "center: row 1 has 5.3e.06 m, .* own frame"),
         (detections(1.2, {"bbox": {"center": pose(1, 0), "size": {"x": 9e9, "y": 1.0}}}), "size: row 0 has 9e.09 m"),
-        (detections(1.2, detection(1, 0), frame_id="car/map"), "frame_id: this is in the fixed frame 'car/map'"),
+        (
+            detections(1.2, detection(1, 0), frame_id="car/map"),
+            "frame_id: this is in the frame 'car/map', and there are no",
+        ),
     ],
     ids=["no orientation", "NaN", "coordinates of a map", "size", "a map"],
 )
