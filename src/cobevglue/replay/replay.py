@@ -55,7 +55,7 @@ class _List:
 
 
 class Replay:
-    """The frames of a recording, in order; iterate once.
+    """The frames of a recording, in order.
 
     Args:
         recording: an open one.
@@ -98,7 +98,6 @@ class Replay:
         self.frames = frames or {}
         self._detector = detector
         self.streams: dict[str, AgentStream] = {}
-        self._collaboration = ObjectCollaboration()
 
     def __iter__(self) -> Iterator[ReplayFrame]:
         """Read the recording.
@@ -106,25 +105,27 @@ class Replay:
         Raises:
             ValueError: the recording is damaged, or a message has a bad value; names topic and message.
         """
+        collaboration = ObjectCollaboration()
         newest: dict[str, _List] = {}
+        self.streams.clear()
         index = 0
         for agent, entry, is_restart in self._lists():
             if is_restart and agent == self.ego:
-                self._collaboration.reset()
+                collaboration.reset()
                 newest.clear()
             elif is_restart:
-                self._collaboration.forget(agent)
+                collaboration.forget(agent)
             newest[agent] = entry
             if agent == self.ego:
-                yield self._frame(index, newest)
+                yield self._frame(index, newest, collaboration)
                 index += 1
 
-    def _frame(self, index: int, newest: dict[str, _List]) -> ReplayFrame:
+    def _frame(self, index: int, newest: dict[str, _List], collaboration: ObjectCollaboration) -> ReplayFrame:
         own = newest[self.ego]
         used = {agent: entry for agent, entry in newest.items() if own.received - entry.received <= self.max_age}
         stamps = {agent: entry.stamp for agent, entry in used.items()}
         bodies = {agent: entry.body for agent, entry in used.items() if entry.body is not None}
-        seen = self._collaboration.step(
+        seen = collaboration.step(
             {agent: entry.boxes for agent, entry in used.items()},
             self.ego,
             own.stamp,
