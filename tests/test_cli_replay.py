@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
@@ -130,9 +132,22 @@ def test_existing_folder_is_kept(drive: Path, capsys: pytest.CaptureFixture[str]
     assert "exists already" in capsys.readouterr().err
 
 
-def test_options_that_mcap_has_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", str(tmp_path / "x"), "--format", "mcap", "--roadside-units", "1"]) == 2
-    assert "--roadside-units: not for --format mcap" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["--roadside-units", "1"], ["--lidar", "beams16"], ["--labels-only"]])
+def test_options_that_mcap_has_not(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    assert main(["simulate", str(tmp_path / "x"), "--format", "mcap", *words]) == 2
+    assert f"{words[0]}: not for --format mcap" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of file sizes are of POSIX")
+def test_full_disk_while_simulating(tmp_path: Path) -> None:
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096));"
+        "from cobevglue.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    words = ["simulate", str(tmp_path / "drive"), "--format", "mcap", "--frames", "40"]
+    done = subprocess.run([sys.executable, "-B", "-c", code, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"error: {tmp_path / 'drive'}: File too large\n"
 
 
 def test_same_seed_gives_the_same_bag(tmp_path: Path) -> None:

@@ -224,6 +224,28 @@ def test_what_is_no_recording_is_named(tmp_path: Path, name: str, content: Any, 
         read(path)
 
 
+@pytest.mark.parametrize("sqlite", [False, True], ids=["MCAP", "SQLite"])
+def test_spoilt_bags_are_errors_or_readable(tmp_path: Path, sqlite: bool) -> None:
+    """Whatever bytes are changed: an error of one kind, or messages."""
+    good = write_bag(tmp_path / "good", TWO_TOPICS, sqlite=sqlite)
+    (path,) = [*good.glob("*.mcap"), *good.glob("*.db3")]
+    data = path.read_bytes()
+    readable = refused = 0
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 0, 0])
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), 3):
+            changed[place] = rng.integers(256)
+        (tmp_path / path.name).write_bytes(changed[: int(rng.integers(len(data)))] if seed % 10 == 0 else changed)
+        try:
+            for _, _, message in read(tmp_path / path.name, "/a/objects", "/b/objects"):
+                boxes_from_ros(message)
+            readable += 1
+        except ValueError:
+            refused += 1
+    assert min(readable, refused) > 0
+
+
 def test_folders_that_are_no_bags(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"empty: a folder without metadata.yaml .* no recording in it"):
