@@ -72,8 +72,7 @@ class ObjectCollaboration:
         """Forget the tracks and the pose of one agent: its next list does not continue its last one."""
         self.aligner.forget(agent)
         self._latest.pop(agent, None)
-        if agent in self._trackers:
-            self._trackers[agent].reset()
+        self._trackers.pop(agent, None)
 
     def step(
         self,

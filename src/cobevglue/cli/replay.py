@@ -103,14 +103,13 @@ def _note(done: int, total: int) -> None:
 
 def _bodies(given: list[str], made: Replay) -> dict[str, Boxes]:
     """Own vehicles from texts such as car1=4.5,1.9."""
-    from cobevglue.boxes import Boxes
+    from cobevglue.cli.body_option import parse_body
 
     bodies = {}
     for text in given:
         agent, numbers = _of_agent("--body", text, made)
         try:
-            length, width, x, y = ([float(number) for number in numbers.split(",")] + [0.0, 0.0])[:4]
-            bodies[agent] = Boxes([(x, y, 0.0)], [(length, width, 1.5)], [0.0])
+            bodies[agent] = parse_body(numbers)
         except ValueError:
             raise InputError(f"--body: must be AGENT=LENGTH,WIDTH or AGENT=LENGTH,WIDTH,X,Y, got {text!r}") from None
     return bodies
