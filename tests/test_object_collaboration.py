@@ -77,7 +77,7 @@ def test_fused_objects_are_each_there_once() -> None:
     assert seen.objects.label is not None
     assert seen.objects.label.tolist() == ["car", "bus"]
     assert seen.objects.score is not None
-    assert seen.objects.score.tolist() == [0.9, 0.7]
+    np.testing.assert_allclose(seen.objects.score, [1 - 0.55 * 0.19, 0.63])
 
 
 def test_own_vehicles_are_fused_once() -> None:

@@ -33,7 +33,8 @@ def merge_boxes(
         nms_iou: overlap up to which two objects may both stay.
 
     Returns:
-        The objects, best first, without labels and track ids.
+        The objects, best first, each with the label of its best-scored box if all sources have labels, without track
+        ids.
 
     Raises:
         ValueError: a source has no scores (names it), or the reliabilities are not S numbers in [0, 1).
@@ -44,13 +45,17 @@ def merge_boxes(
     reliabilities = np.full(len(sources), _RELIABILITY) if reliability is None else np.asarray(reliability, np.float64)
     if reliabilities.shape != (len(sources),) or not ((reliabilities >= 0.0) & (reliabilities < 1.0)).all():
         raise ValueError(f"reliability must be {len(sources)} numbers in [0, 1), got {reliability}")
-    boxes = Boxes.concatenate([one.replace(label=None, track_id=None) for one in sources])
+    labelled = all(one.label is not None for one in sources)
+    boxes = Boxes.concatenate([one.replace(track_id=None, label=one.label if labelled else None) for one in sources])
     if not len(boxes):
         return boxes
     assert boxes.score is not None
     source = np.repeat(np.arange(len(sources)), [len(one) for one in sources])
     cluster = _clusters(boxes, source, min_iou)
     merged = _averages(boxes, cluster, reliabilities[source])
+    if boxes.label is not None:
+        best_first = np.argsort(-boxes.score, kind="stable")
+        merged = merged.replace(label=boxes.label[best_first[np.unique(cluster[best_first], return_index=True)[1]]])
     return merged[nms(merged, nms_iou)]
 
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cobevglue.alignment import Alignment, GroupAligner, Observation, group_aligner
+from cobevglue.box_merging import merge_boxes
 from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.clock import Clock
 from cobevglue.datasets.frame import did_you_mean
-from cobevglue.iou import nms
 from cobevglue.se2 import SE2
 from cobevglue.tracking import Sort
 from cobevglue.typing import BoolArray
@@ -27,8 +27,6 @@ __all__ = ["FusedObjects", "ObjectCollaboration"]
 
 _PERIOD = 0.1
 """Time between steps that come without a time [s]."""
-_SAME_OBJECT = 0.15
-"""Boxes that overlap by a larger IoU are one object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +34,9 @@ class FusedObjects:
     """The result of one step.
 
     Attributes:
-        objects: everyone's objects without the ego itself, in the ego frame at the ego's instant, best first; with
-            score (1 where a list has none) and label ("" likewise), without track ids.
+        objects: all agents' objects without the ego itself, in the ego frame at the ego's instant, merged by
+            `merge_boxes`, best first; with score (made of 1 where a list has none) and label ("" likewise), without
+            track ids.
         alignments: of every other agent; the lists of those refused are not fused.
         lists: the lists as they were aligned, each in its agent's frame, with `track_id`.
     """
@@ -134,16 +133,16 @@ class ObjectCollaboration:
 def _fused(
     lists: Mapping[str, Boxes], ego: str, alignments: Mapping[str, Alignment], bodies: Mapping[str, Boxes]
 ) -> Boxes:
-    """Everyone's objects in the ego frame; of those that overlap the one with the best score, if equal the ego's."""
+    """All agents' objects in the ego frame, merged."""
     parts = [_comparable(lists[ego])]
     for agent, alignment in alignments.items():
         if alignment.ego_SE2_other is not None:
-            received = [_comparable(alignment.boxes_at_ego_instant(lists[agent]))]
+            received = _comparable(alignment.boxes_at_ego_instant(lists[agent]))
             if agent in bodies:
-                received.append(_comparable(bodies[agent].transform(alignment.ego_SE2_other)))
-            parts += [boxes[~_is_ego(boxes, bodies.get(ego))] for boxes in received]
-    boxes = Boxes.concatenate(parts)
-    return boxes[nms(boxes, _SAME_OBJECT)] if len(boxes) else boxes
+                own = _comparable(bodies[agent].transform(alignment.ego_SE2_other))
+                received = Boxes.concatenate([received, own])
+            parts.append(received[~_is_ego(received, bodies.get(ego))])
+    return merge_boxes(parts)
 
 
 def _comparable(boxes: Boxes) -> Boxes:
