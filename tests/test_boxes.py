@@ -209,7 +209,7 @@ def test_concatenate_drops_partial_fields_refuses_repeated_ids() -> None:
 def test_selected_boxes_are_reversed() -> None:
     yaw = [0.1, -3.0, 7.0, math.pi]
     boxes = Boxes(np.zeros((4, 3)), np.ones((4, 3)), yaw, score=[0.1, 0.2, 0.3, 0.4])
-    turned = boxes.turned_round([True, True, False, False])
+    turned = boxes.flip_headings([True, True, False, False])
     assert turned.yaw.tolist() == pytest.approx([0.1 - math.pi, math.pi - 3.0, 7.0, math.pi], abs=1e-12)
     assert turned.yaw[2:].tolist() == yaw[2:]
     assert turned.score is not None

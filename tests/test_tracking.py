@@ -176,7 +176,7 @@ def test_flipped_heading_does_not_break_track(flipped: set[int]) -> None:
         assert tracker.tracks.boxes.yaw[0] == pytest.approx(np.radians(30), abs=0.02)
 
 
-def test_a_track_that_began_flipped_is_turned_round() -> None:
+def test_a_track_that_began_flipped_is_flipped_back() -> None:
     tracker = Sort()
     for k in range(6):
         tracker.update(cars([(0, 0)], 180 if k == 0 else 5))

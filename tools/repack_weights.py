@@ -16,7 +16,7 @@ from typing import Any
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.relative_paths import without_absolute_paths
 
 
@@ -39,7 +39,7 @@ def repack(
     if len(tensors) != count:
         raise ValueError(f"{path}: two tensors would have the same name")
     header["metadata"] = json.dumps(metadata(json.loads(header["metadata"])))
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         save_file(tensors, partial, header)
 
 

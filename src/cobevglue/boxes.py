@@ -103,7 +103,7 @@ class Boxes:
         """(N, 5) x, y, length, width, yaw: the boxes seen from above."""
         return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
 
-    def turned_round(self, which: ArrayLike) -> Boxes:
+    def flip_headings(self, which: ArrayLike) -> Boxes:
         """These boxes, those that `which` (N,) is True for turned by 180 degrees, with headings in [-pi, pi)."""
         return self.replace(yaw=np.where(which, wrap_angle(self.yaw + np.pi), self.yaw))
 

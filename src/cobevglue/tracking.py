@@ -189,7 +189,7 @@ class Sort:
         rows = np.searchsorted(s.id, ids)
         if len(ids) != len(boxes) or not (rows < len(s)).all() or not (s.id[rows] == ids).all():
             raise ValueError("boxes must have the track_id of living tracks, as update returns them")
-        return boxes.turned_round(np.cos(boxes.yaw - s.yaw[rows]) < 0.0)
+        return boxes.flip_headings(np.cos(boxes.yaw - s.yaw[rows]) < 0.0)
 
     @property
     def tracks(self) -> Tracks:

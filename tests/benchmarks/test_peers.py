@@ -106,7 +106,7 @@ def test_other_classes_are_never_matched(peer: type[SingleFrameMatcher]) -> None
 )
 def test_headings_off_by_half_a_turn(matcher: SingleFrameMatcher) -> None:
     ego = cars(FIVE)
-    other = ego.turned_round([False, True, False, True, True]).transform(EGO_SE2_OTHER.inverse())
+    other = ego.flip_headings([False, True, False, True, True]).transform(EGO_SE2_OTHER.inverse())
     found = matcher.align(ego, other)
     assert found.ego_SE2_other is not None, found.reason
     assert found.ego_SE2_other.error_to(EGO_SE2_OTHER) == pytest.approx((0.0, 0.0), abs=1e-6)

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.atomic_files import write_json
 from cobevglue.datasets.pcd import write_pcd_intensity
 from cobevglue.datasets.poses import rigid_SE3, transform_boxes
-from cobevglue.datasets.whole_files import write_json
 from cobevglue.typing import ArrayLike, FloatArray
 
 __all__ = ["DAIRPair", "DAIRSide", "dair_v2x_frame_files", "write_dair_v2x_frame", "write_dair_v2x_index"]

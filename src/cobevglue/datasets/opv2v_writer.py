@@ -10,9 +10,9 @@ import numpy as np
 import yaml
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.datasets.pcd import write_pcd_rgb
 from cobevglue.datasets.poses import carla_from_SE3, rigid_SE3
-from cobevglue.datasets.whole_files import whole_file
 from cobevglue.datasets.yaml_tree import check_timestamp
 from cobevglue.typing import ArrayLike
 
@@ -87,7 +87,7 @@ def write_opv2v_frame(
     folder = Path(agent_folder)
     if points is not None:
         write_pcd_rgb(folder / f"{timestamp}.pcd", points)
-    with whole_file(folder / f"{timestamp}.yaml") as path, path.open("w", encoding="utf-8") as file:
+    with atomic_write(folder / f"{timestamp}.yaml") as path, path.open("w", encoding="utf-8") as file:
         yaml.dump(document, file, Dumper=_SafeDumper)
 
 

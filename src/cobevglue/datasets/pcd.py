@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.typing import ArrayLike, Float32Array
 
 __all__ = ["read_bin", "read_pcd", "write_pcd_intensity", "write_pcd_rgb"]
@@ -140,7 +140,7 @@ def _write(path: Path, fields: Sequence[str], columns: Sequence[Float32Array]) -
     from pypcd4.pypcd4 import Encoding, PointCloud  # imported here: it takes longer than the rest of the package
 
     cloud = PointCloud.from_points(list(columns), fields, (np.float32,) * len(fields))
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         cloud.save(partial, encoding=Encoding.BINARY)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import yaml
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.datasets.pcd import write_pcd_rgb
 from cobevglue.datasets.poses import mirrored, rigid_SE3
 from cobevglue.datasets.v2v4real import LEFT_HANDED
-from cobevglue.datasets.whole_files import whole_file
 from cobevglue.datasets.yaml_tree import check_timestamp
 from cobevglue.typing import ArrayLike
 
@@ -84,5 +84,5 @@ def write_v2v4real_frame(
     text = yaml.dump(document, Dumper=_Dumper).replace("numpy._core.", "numpy.core.")
     if points is not None:
         write_pcd_rgb(folder / f"{timestamp}.pcd", points, left_handed=left_handed)
-    with whole_file(folder / f"{timestamp}.yaml") as path:
+    with atomic_write(folder / f"{timestamp}.yaml") as path:
         path.write_text(text, encoding="utf-8")

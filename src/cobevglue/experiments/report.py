@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.pictures import Picture
 from cobevglue.experiments.study import StudySettings
@@ -108,5 +108,5 @@ def _titled(table: Table, label: str, several: bool) -> Table:
 
 
 def _write(path: Path, text: str) -> None:
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from cobevglue.boxes import Boxes
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.experiments.condition import Condition
 from cobevglue.typing import FloatArray, IntArray
 
@@ -173,7 +173,7 @@ def write_result(path: Path, result: ScenarioResult) -> None:
         "conditions": conditions,
     }
     detections = [frame.boxes for run in result.conditions.values() for frame in run.frames.values()]
-    with whole_file(path) as partial, partial.open("wb") as file:
+    with atomic_write(path) as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
             document=np.frombuffer(json.dumps(document, allow_nan=False).encode(), np.uint8),

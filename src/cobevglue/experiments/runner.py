@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cobevglue import __version__
-from cobevglue.datasets.whole_files import write_json
+from cobevglue.datasets.atomic_files import write_json
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.results import ConditionResult, ScenarioResult, read_result, write_result

@@ -30,4 +30,4 @@ def vote_headings(boxes: Boxes, transmitted: Iterable[Boxes]) -> Boxes:
         overlap = bev_iou(boxes, one)
         weight = np.where(overlap >= _SAME_OBJECT, overlap, 0.0) * (1.0 if one.score is None else one.score)
         vote += (weight * np.sign(np.cos(boxes.yaw[:, None] - one.yaw))).sum(axis=1)
-    return boxes.turned_round(vote < 0.0)
+    return boxes.flip_headings(vote < 0.0)

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.datasets.poses import inverse_SE3, rigid_SE3, transform_boxes
 from cobevglue.datasets.tracking_text import kitti_box
-from cobevglue.datasets.whole_files import whole_file
 from cobevglue.se2 import wrap_angle
 from cobevglue.typing import ArrayLike, FloatArray
 
@@ -168,7 +168,7 @@ def write_kitti_objects(path: str | Path, boxes: Boxes, camera_SE3_lidar: ArrayL
         if boxes.score is not None:
             numbers.append(float(boxes.score[row]))
         lines.append(f"{label} -1 -1 -10 -1 -1 -1 -1 {' '.join(map(repr, numbers))}\n")
-    with whole_file(Path(path)) as file:
+    with atomic_write(Path(path)) as file:
         file.write_text("".join(lines), encoding="utf-8")
 
 

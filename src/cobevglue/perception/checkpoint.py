@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.relative_paths import without_absolute_paths
 
 __all__ = ["Checkpoint", "fingerprint", "load_checkpoint", "load_weights", "save_checkpoint"]
@@ -64,7 +64,7 @@ def save_checkpoint(
         "config": json.dumps(config),
         "metadata": json.dumps(without_absolute_paths(dict(metadata or {}))),
     }
-    with whole_file(Path(path)) as partial:
+    with atomic_write(Path(path)) as partial:
         save_file(weights, partial, header)
 
 

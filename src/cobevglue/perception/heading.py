@@ -160,5 +160,5 @@ def refine_headings(detections: Detections, points: Float32Array, net: HeadingRe
     device = next(net.parameters()).device
     logits = net(HeadingInputs(*(t.to(device) for t in heading_inputs(points, detections)))).double().cpu().numpy()
     return detections._replace(
-        boxes=detections.boxes.turned_round(logits < 0.0), heading_confidence=np.tanh(np.abs(logits) / 2.0)
+        boxes=detections.boxes.flip_headings(logits < 0.0), heading_confidence=np.tanh(np.abs(logits) / 2.0)
     )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from cobevglue.datasets.whole_files import errors_name
+from cobevglue.datasets.atomic_files import name_file_in_errors
 from cobevglue.replay.replay import Replay, ReplayFrame
 from cobevglue.replay.summary import Summary, frame_line
 
@@ -44,7 +44,7 @@ def run_replay(
     """
     if out is None:
         return _run(replay, None, rerun, progress)
-    with errors_name(out):
+    with name_file_in_errors(out):
         return _run(replay, out, rerun, progress)
 
 

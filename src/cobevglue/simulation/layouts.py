@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 import cobevglue
+from cobevglue.datasets.atomic_files import write_json
 from cobevglue.datasets.dair_v2x_writer import (
     DAIRPair,
     DAIRSide,
@@ -21,7 +22,6 @@ from cobevglue.datasets.dair_v2x_writer import (
 )
 from cobevglue.datasets.opv2v_writer import write_opv2v_frame
 from cobevglue.datasets.v2v4real_writer import write_v2v4real_frame
-from cobevglue.datasets.whole_files import write_json
 from cobevglue.simulation.road_network import NETWORKS
 from cobevglue.simulation.scenario import ScenarioSettings, SimulatedScenario
 from cobevglue.simulation.traffic import TrafficSnapshot

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 import cobevglue
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 
 __all__ = ["LAST", "STATE", "RunState", "begin_run", "differing_keys", "load_state", "provenance", "save_state"]
 
@@ -54,7 +54,7 @@ class RunState:
 def save_state(path: Path, state: RunState) -> None:
     """Write the state of a run atomically."""
     content = {**vars(state), "config": json.dumps(state.config), "format": _FORMAT}
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         torch.save(content, partial)
 
 

@@ -20,10 +20,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cobevglue.boxes import Boxes, covers_origin
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.datasets.frame import Frame
 from cobevglue.datasets.labelled_cloud import count_points
 from cobevglue.datasets.poses import inverse_SE3, transform_boxes
-from cobevglue.datasets.whole_files import whole_file
 from cobevglue.fusion.early import merge_points
 from cobevglue.fusion.method import Received
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars, PointPillarsConfig
@@ -176,7 +176,7 @@ def _write_scenario(folder: Path, config: FeatureConfig, detector: PointPillars,
     files = []
     for index, frame in enumerate(_frames(number, config, detector)):
         file = folder / f"{number:04d}_{index:02d}.safetensors"
-        with whole_file(file) as partial:
+        with atomic_write(file) as partial:
             save_file(_as_tensors(frame), partial)
         files.append(file.name)
     return files

@@ -17,8 +17,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from cobevglue.datasets.atomic_files import atomic_write
 from cobevglue.datasets.labelled_cloud import LabelledCloud
-from cobevglue.datasets.whole_files import whole_file
 from cobevglue.iou import bev_iou
 from cobevglue.perception import PointPillars
 from cobevglue.perception.checkpoint import fingerprint
@@ -131,7 +131,7 @@ def _write(
         for name, values in zip(HeadingInputs._fields, zip(*(e.inputs for e in examples), strict=True), strict=True)
     }
     file = folder / f"{episode:04d}.safetensors"
-    with whole_file(file) as partial_file:
+    with atomic_write(file) as partial_file:
         save_file({**inputs, "right": torch.cat([e.correct for e in examples])}, partial_file)
     return [file.name]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from cobevglue.datasets.whole_files import write_json
+from cobevglue.datasets.atomic_files import write_json
 
 __all__ = ["read_index", "write_shards"]
 

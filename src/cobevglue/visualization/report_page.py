@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 
 __all__ = ["Part", "figure", "paragraphs", "table", "write_page"]
 
@@ -165,6 +165,6 @@ def write_page(
         + "\n</body>\n</html>\n"
     )
     target = Path(path)
-    with whole_file(target) as partial:
+    with atomic_write(target) as partial:
         partial.write_text(page, encoding="utf-8")
     return target

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cobevglue.datasets.whole_files import whole_file
+from cobevglue.datasets.atomic_files import atomic_write
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
@@ -17,7 +17,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
         temporary.write_text("half")
         raise OSError("disk full")
 
-    with pytest.raises(OSError, match="disk full"), whole_file(path) as partial:
+    with pytest.raises(OSError, match="disk full"), atomic_write(path) as partial:
         fail(partial)
     assert path.read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1

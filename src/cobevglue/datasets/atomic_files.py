@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["errors_name", "whole_file", "write_json"]
+__all__ = ["atomic_write", "name_file_in_errors", "write_json"]
 
 
 @contextmanager
-def errors_name(path: Path) -> Iterator[None]:
+def name_file_in_errors(path: Path) -> Iterator[None]:
     """Errors of the system that name no file, such as that of a full disk, name this one."""
     try:
         yield
@@ -24,7 +24,7 @@ def errors_name(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A temporary path to write to, which replaces `path` on success; parent folders are created.
 
     It is in the same folder, with a name that readers of data sets ignore and that no other process uses.
@@ -42,5 +42,5 @@ def whole_file(path: Path) -> Iterator[Path]:
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
     """Write a JSON file atomically; NaN is an error."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
