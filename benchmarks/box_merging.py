@@ -12,13 +12,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from common import print_head
-
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.runner import run_study
 from cobevglue.experiments.study import SEED, StudySettings
+from common import print_head
 
 _FUSIONS = {"late fusion": "late", "features": "cobevglue-features", "features and boxes": "cobevglue"}
 _COLUMNS: dict[str, dict[str, Any]] = {
