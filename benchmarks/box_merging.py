@@ -1,6 +1,6 @@
 """Average precision of features, boxes and both together: true poses, BEVGlue's poses, invented boxes, late messages.
 
-    python benchmarks/box_merging.py                                # the first twelve simulated test sequences, 240 frames
+    python benchmarks/box_merging.py                               # twelve simulated test sequences, 240 frames
     python benchmarks/box_merging.py --split validation --seed 77   # what the reliabilities were chosen on
 
 Results of finished sequences are kept in `--out`, so that an interrupted run resumes.
