@@ -68,6 +68,12 @@ class ObjectCollaboration:
         self._trackers: dict[str, Sort] = {}
         self._latest: dict[str, tuple[float, Boxes]] = {}
 
+    def forget(self, agent: str) -> None:
+        """Forget the tracks and the pose of one agent: its next list is its first."""
+        self.aligner.forget(agent)
+        self._trackers.pop(agent, None)
+        self._latest.pop(agent, None)
+
     def step(
         self,
         objects: Mapping[str, Boxes],

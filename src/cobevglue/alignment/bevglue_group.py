@@ -86,6 +86,10 @@ class BEVGlueGroup(GroupAligner):
         """Forget all frames."""
         self._aligners.clear()
 
+    def forget(self, agent: str) -> None:
+        """Forget all pairs with this agent."""
+        self._aligners = {pair: aligner for pair, aligner in self._aligners.items() if agent not in pair}
+
     def _judge(self, direct: Alignment, found: _Pose, ego: Boxes, other: Boxes, names: list[str]) -> Alignment:
         """The alignment of an agent, from that with the ego alone and from the group's pose."""
 

@@ -77,6 +77,9 @@ class GroupAligner(ABC):
     def reset(self) -> None:  # noqa: B027  # not abstract: most have no state
         """Forget all frames; does nothing for aligners without a state."""
 
+    def forget(self, agent: str) -> None:  # noqa: B027  # likewise
+        """Forget one collaborator; does nothing for aligners without a state."""
+
     def select_inputs(self, observation: Observation) -> Observation:
         """The part of an observation that this aligner uses.
 
@@ -147,3 +150,7 @@ class Pairwise(GroupAligner):
     def reset(self) -> None:
         """Forget all collaborators."""
         self._aligners.clear()
+
+    def forget(self, agent: str) -> None:
+        """Forget one collaborator."""
+        self._aligners.pop(agent, None)
