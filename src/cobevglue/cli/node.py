@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -72,9 +72,9 @@ def node(
     from cobevglue.node.network import zenoh_config
 
     inbox, page, stop = Inbox(), MetricsPage(), threading.Event()
-    with ExitStack() as stack, _ended_by_signals(stop):
+    with ExitStack() as stack:
         with expected_errors(), _missing_package():
-            settings = NodeSettings(forget=forget, aligner=aligner)
+            settings = NodeSettings.model_validate({"forget": forget, "aligner": aligner})
             core = NodeCore(agent, new_session(), settings)
             config = zenoh_config(listen or (), connect or (), router, zenoh)
             if metrics is not None:
@@ -82,6 +82,7 @@ def node(
                 print_note(f"metrics: http://127.0.0.1:{port}/metrics")
             warm_up()
             page.text = core.metrics.text()
+            stack.enter_context(_ended_by_signals(stop))
             network = stack.enter_context(connected(agent, config, inbox, lists))
         stack.enter_context(nullcontext() if lists is not None else _standard_input(inbox, stop))
         status = _StatusLine(core)
@@ -166,5 +167,4 @@ class _StatusLine:
 
     @staticmethod
     def _show(text: str, before: str, after: str) -> None:
-        with_one_line: Callable[[str], str] = lambda words: " ".join(words.split())  # noqa: E731
-        print(before + with_one_line(text), end=after, file=sys.stderr, flush=True)
+        print(before + " ".join(text.split()), end=after, file=sys.stderr, flush=True)

@@ -16,8 +16,8 @@ LONGEST_LINE = 4 << 20
 def read_lines(descriptor: int, stop: threading.Event) -> Iterator[bytes]:
     """The lines, without their line breaks and without empty ones.
 
-    Unlike a loop over `sys.stdin` it can be ended while it waits: a thread that hangs in a read would hold its lock when
-    the program ends.
+    Unlike a loop over `sys.stdin` it can be ended while it waits: a thread that hangs in a read would hold its lock
+    when the program ends.
 
     Args:
         descriptor: of the stream.

@@ -52,7 +52,7 @@ def zenoh_config(
     """
     zenoh = _zenoh()
     try:
-        config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
+        config: Config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
         if file is None or listen or connect or router:
             config.insert_json5("mode", '"client"' if router else '"peer"')
         if listen:

@@ -1,9 +1,9 @@
-"""The node's own object lists, as one line of JSON each:
+"""The node's own object lists, as one line of JSON each.
 
     {"time": 12.3, "boxes": [{"x": 12.5, "y": -3.0, "l": 4.5, "w": 1.9, "yaw": 0.1}, …], "body": {"x": 0, …}}
 
-An object list as `cobevglue.messages.object_list` has it, with `time`, its time stamp [s], and `body`, the own vehicle in
-its own frame. Both may be left out.
+An object list as `cobevglue.messages.object_list` has it, with `time`, its time stamp [s], and `body`, the own vehicle
+in its own frame. Both may be left out.
 """
 
 from __future__ import annotations
