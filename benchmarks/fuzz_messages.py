@@ -8,7 +8,8 @@ Valid messages of both formats are damaged: flipped bits, other bytes, slices re
 message, cut off, special numbers. In half of the object messages the checksum is made right again afterwards, so that
 the damage gets past it. Then:
 
-- Decoding raises MessageError or returns; any other exception is a failure, and so is one that takes over a second.
+- Decoding raises MessageError or returns; any other exception is a failure, and so is more than a second of
+  processor time.
 - An object message that decodes has a valid checksum and means what its bytes say, by a second, plain reading of them.
   If its checksum was not made right again, it is byte for byte a message that was sent.
 - A CPM has no checksum: a flipped bit may move a box. Its boxes are finite and within the standard's ranges, and
@@ -41,7 +42,7 @@ from common import print_head
 
 FORMATS = ("object", "cpm")
 SLOW = 1.0
-"""A message may take so long to decode [s]."""
+"""A message may take so much processor time to decode [s]."""
 NODE_EVERY, ALIGN_EVERY = 10, 100
 """A node gets one in so many messages, and aligns after so many of those."""
 _SPECIAL = (b"\x00", b"\xff", b"\x7f", b"\x80", struct.pack("<f", math.nan), struct.pack("<f", math.inf))
@@ -121,9 +122,9 @@ def fuzz(name: str, seed: int, go_on: Callable[[int], bool]) -> Report:
                 data = data[:-4] + struct.pack("<I", zlib.crc32(data[:-4]))
             report.messages += 1
             report.unchanged += data in known
-            started = time.perf_counter()
+            started = time.thread_time()
             check(data, known, repaired, report)
-            report.slowest = max(report.slowest, time.perf_counter() - started)
+            report.slowest = max(report.slowest, time.thread_time() - started)
             if name == "cpm":
                 check_header(original, data, report)
             if report.messages % NODE_EVERY == 0:
