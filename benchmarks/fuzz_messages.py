@@ -29,8 +29,8 @@ import sys
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from cobevglue import Boxes
 from cobevglue.messages import MessageError, ObjectMessage, cpm, decode, encode
 from cobevglue.messages.cpm import CollectivePerception
 from cobevglue.node import NodeCore, OwnList, SessionHeader, decode_header, encode_header
+from cobevglue.typing import FloatArray
 from common import print_head
 
 FORMATS = ("object", "cpm")
@@ -45,7 +46,14 @@ SLOW = 1.0
 """A message may take so much processor time to decode [s]."""
 NODE_EVERY, ALIGN_EVERY = 10, 100
 """A node gets one in so many messages, and aligns after so many of those."""
-_SPECIAL = (b"\x00", b"\xff", b"\x7f", b"\x80", struct.pack("<f", math.nan), struct.pack("<f", math.inf))
+_SPECIAL: tuple[bytes, ...] = (
+    b"\x00",
+    b"\xff",
+    b"\x7f",
+    b"\x80",
+    struct.pack("<f", math.nan),
+    struct.pack("<f", math.inf),
+)
 _SPECIAL += tuple(struct.pack("<f", value) for value in (3.4e38, -1.0, -2.0, 1e-45, 16777216.0, 3.1415927))
 _SPECIAL += tuple(struct.pack("<d", value) for value in (math.nan, -math.inf, 1e300, 1e11))
 _IN_PLACE, _ALL = (0, 1, 7, 8), tuple(range(9))
@@ -87,34 +95,34 @@ def main() -> None:
     for name in chosen:
         started = time.monotonic()
         if arguments.messages is None:
-            end = started + arguments.seconds / len(chosen)
-            report = fuzz(name, arguments.seed, lambda _, end=end: time.monotonic() < end)
+            seconds, most = arguments.seconds / len(chosen), sys.maxsize
         else:
-            most = arguments.messages // len(chosen)
-            report = fuzz(name, arguments.seed, lambda done, most=most: done < most)
+            seconds, most = math.inf, arguments.messages // len(chosen)
+        report = fuzz(name, arguments.seed, most, seconds)
         show(name, report, time.monotonic() - started)
         failed |= bool(report.failures)
     sys.exit(failed)
 
 
-def fuzz(name: str, seed: int, go_on: Callable[[int], bool]) -> Report:
+def fuzz(name: str, seed: int, messages: int, seconds: float = math.inf) -> Report:
     """Damage and check messages of one format.
 
     Args:
         name: of the format, in `FORMATS`.
         seed: of the random numbers.
-        go_on: from the number of messages so far, whether there shall be more.
+        messages: how many at most; rounded up to hundreds.
+        seconds: for how long at most [s].
     """
     stream = FORMATS.index(name)
     originals = object_messages(seed) if name == "object" else cpms(seed)
     check = check_object_message if name == "object" else check_cpm
     known = frozenset(originals)
     report, node = Report(), Node()
-    batch = 0
-    while go_on(report.messages):
+    batch, end = 0, time.monotonic() + seconds
+    while report.messages < messages and time.monotonic() < end:
         rng = np.random.default_rng([seed, stream, batch])
         batch += 1
-        for _ in range(200):
+        for _ in range(100):
             original = originals[rng.integers(len(originals))]
             repaired = name == "object" and rng.random() < 0.5
             data = damaged(original, originals, rng, _IN_PLACE if repaired else _ALL)
@@ -255,7 +263,7 @@ class Node:
             report.fail(f"node: {type(error).__name__}: {error}", data)
 
 
-def rows_of(message: ObjectMessage) -> np.ndarray:
+def rows_of(message: ObjectMessage) -> FloatArray:
     """(N, 7) x, y, z, l, w, h, yaw of the boxes, and of the own vehicle as the last row."""
     boxes = message.boxes
     rows = np.column_stack([boxes.center, boxes.size, boxes.yaw])
@@ -264,7 +272,7 @@ def rows_of(message: ObjectMessage) -> np.ndarray:
     return np.vstack([rows, np.column_stack([message.body.center, message.body.size, message.body.yaw])])
 
 
-def rows_in(data: bytes) -> np.ndarray:
+def rows_in(data: bytes) -> FloatArray:
     """The same, read from the bytes one number after the other as the layout's table says."""
     version, id_length, count = struct.unpack_from("<BBH", data, 4)
     offset = 20
@@ -322,10 +330,10 @@ def cpms(seed: int) -> list[bytes]:
     for index, n in enumerate((0, 1, 2, 3, 6)):
         rng = np.random.default_rng([seed, 11, index])
         boxes = random_boxes(rng, n, True).replace(label=np.full(n, "car"), score=rng.uniform(0.0, 1.0, n))
-        more = {"velocity": rng.normal(0.0, 10.0, (n, 2)), "age": np.full(n, 1.0)} if index % 2 else {}
-        accuracy = {"position_std": np.full(n, 0.2), "yaw_std": np.full(n, 0.02)} if index % 3 else {}
+        more: dict[str, Any] = {"velocity": rng.normal(0.0, 10.0, (n, 2)), "age": np.full(n, 1.0)} if index % 2 else {}
+        accuracy: dict[str, Any] = {"position_std": np.full(n, 0.2), "yaw_std": np.full(n, 0.02)} if index % 3 else {}
         heading = (None, 0.5, -2.0)[index % 3]
-        roadside = {"is_infrastructure": True} if index == 4 else {}
+        roadside: dict[str, Any] = {"is_infrastructure": True} if index == 4 else {}
         messages.append(
             cpm.encode(CollectivePerception(7 + index, 7e8, boxes, heading=heading, **more, **accuracy, **roadside))
         )

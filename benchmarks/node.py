@@ -2,6 +2,7 @@
 
     python benchmarks/node.py                             # one minute of eight agents at 10 Hz on this machine
     python benchmarks/node.py --seconds 1800              # half an hour
+    python benchmarks/node.py --realtime                  # undisturbed by other work on the machine (needs root)
     python benchmarks/node.py --only time-lapse --frames 864000    # 24 h of frames, without a network
     python benchmarks/node.py --json results.json
 
@@ -15,6 +16,7 @@ damaged, and the senders restart now and then.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
@@ -45,8 +47,8 @@ from common import print_head
 
 RATE = 10.0
 AGENTS = tuple(f"car{number}" for number in range(1, 9))
-KILL_EVERY, DOWN_FOR = 15.0, 1.5
-"""An agent is killed so often [s], and is down for so long [s]; then it takes some seconds to start."""
+DOWN_FOR, LOOK_FOR = 1.5, 10.0
+"""A killed agent is down for so long, and then takes some seconds to start; alignments are looked for so long [s]."""
 SETTLED = 20.0
 """Memory is compared from then on [s]."""
 LOST, DOUBLED, LATE, DAMAGED = 0.05, 0.02, 0.03, 0.01
@@ -60,6 +62,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=("soak", "time-lapse"))
     parser.add_argument("--seconds", type=float, default=60.0, help="of the soak")
+    parser.add_argument("--realtime", action="store_true", help="real-time priority for agents that have started")
+    parser.add_argument("--kill-every", type=float, default=15.0, help="[s]")
     parser.add_argument("--frames", type=int, default=3000, help="of the time-lapse")
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--json", type=Path)
@@ -67,7 +71,7 @@ def main() -> None:
     print_head(f"seed {arguments.seed}")
     results: dict[str, Any] = {}
     if arguments.only != "time-lapse":
-        results["soak"] = soak(arguments.seconds, arguments.seed)
+        results["soak"] = soak(arguments.seconds, arguments.seed, arguments.kill_every, arguments.realtime)
     if arguments.only != "soak":
         results["time-lapse"] = time_lapse(arguments.frames, arguments.seed)
     if arguments.json:
@@ -112,6 +116,7 @@ class AgentProcess:
             stdin=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=os.environ | {"OMP_NUM_THREADS": "1"},
+            preexec_fn=lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)),
         )
         assert self.process.stdin is not None
         os.set_blocking(self.process.stdin.fileno(), False)
@@ -121,10 +126,8 @@ class AgentProcess:
     def feed(self, line: bytes) -> None:
         """Give it a list; lost if it does not read."""
         if self.process is not None and self.process.stdin is not None:
-            try:
+            with contextlib.suppress(BlockingIOError, BrokenPipeError):
                 os.write(self.process.stdin.fileno(), line)
-            except (BlockingIOError, BrokenPipeError):
-                pass
 
     def kill(self) -> None:
         """SIGKILL."""
@@ -136,6 +139,11 @@ class AgentProcess:
     def is_ready(self) -> bool:
         """Whether it answers."""
         return bool(self.metrics())
+
+    def prioritise(self) -> None:
+        """Real-time priority, once it has started: on a computer of its own it would not compete with the others."""
+        assert self.process is not None
+        set_realtime(self.process.pid)
 
     def metrics(self) -> dict[str, float]:
         """Its metrics by name and labels; empty if it does not answer."""
@@ -162,7 +170,7 @@ class Listener:
         from cobevglue.node.network import zenoh_config
 
         self.results: list[tuple[float, dict[str, Any]]] = []
-        self._session = zenoh.open(zenoh_config(connect=endpoints))
+        self._session: Any = zenoh.open(zenoh_config(connect=endpoints))
         self._subscriber = self._session.declare_subscriber("cobevglue/*/alignments", self._take)
 
     def _take(self, sample: Any) -> None:
@@ -173,7 +181,7 @@ class Listener:
         self._session.close()
 
 
-def soak(seconds: float, seed: int) -> dict[str, Any]:
+def soak(seconds: float, seed: int, kill_every: float, realtime: bool) -> dict[str, Any]:
     """Eight agents for so long; kills and restarts one after the other."""
     warm_up()  # fills the cache of compiled kernels
     ports = free_ports(2 * len(AGENTS))
@@ -186,30 +194,37 @@ def soak(seconds: float, seed: int) -> dict[str, Any]:
         agent.start()
     while not all(agent.is_ready() for agent in agents):
         time.sleep(0.5)
+    if realtime:
+        for agent in agents:
+            agent.prioritise()
     listener = Listener(endpoints)
     stop = threading.Event()
     feeder = threading.Thread(target=feed, args=(agents, seed, stop))
     feeder.start()
+    if realtime:
+        set_realtime(os.getpid())
     started = time.time()
     handled: Counter[str] = Counter()
     restarts: list[tuple[str, float]] = []
-    next_kill, victims, revive = started + KILL_EVERY, cycle(range(1, len(agents))), 0.0
+    next_kill, victims, revive = started + kill_every, cycle(range(1, len(agents))), 0.0
     victim: AgentProcess | None = None
     while (now := time.time()) < started + seconds:
-        if victim is None and now >= next_kill and now < started + seconds - 10.0:
+        if victim is None and now >= next_kill and now < started + seconds - LOOK_FOR:
             victim = agents[next(victims)]
             add_handled(handled, victim)
             victim.kill()
             restarts.append((victim.name, now))
-            revive, next_kill = now + DOWN_FOR, next_kill + KILL_EVERY
-        elif victim is not None and now >= revive:
+            revive, next_kill = now + DOWN_FOR, next_kill + kill_every
+        elif victim is not None and victim.process is None and now >= revive:
             victim.start()
+        elif victim is not None and victim.process is not None and victim.is_ready():
+            if realtime:
+                victim.prioritise()
             victim = None
-        if int(now - started) % 5 == 0:
+        if victim is None:
             for agent in agents:
-                if agent is not victim:
-                    agent.note_memory(now - started)
-        time.sleep(1.0)
+                agent.note_memory(now - started)
+        time.sleep(1.0 if victim is None else 0.05)
     for agent in agents:
         add_handled(handled, agent)
     refused = Counter[str]()
@@ -239,7 +254,7 @@ def soak(seconds: float, seed: int) -> dict[str, Any]:
         **accepted(listener.results),
         **times_to_alignment(listener.results, restarts),
         "exit codes after SIGTERM": str(exit_codes),
-        "load average": f"{os.getloadavg()[0]:.1f}",
+        "real-time priority; load average": f"{'yes' if realtime else 'no'}; {os.getloadavg()[0]:.1f}",
     }
     show("Soak", results)
     return results
@@ -309,7 +324,7 @@ def times_to_alignment(
         again += 1
         found: dict[tuple[str, str], float] = {}
         for t, document in later:
-            if first <= t <= first + KILL_EVERY - 5.0:
+            if first <= t <= first + LOOK_FOR:
                 for pair in pairs_accepted([document], name):
                     found.setdefault(pair, t - first)
         times += [found.get(pair, math.inf) for pair in sorted(before)]
@@ -334,6 +349,12 @@ def pairs_accepted(documents: list[dict[str, Any]], name: str) -> set[tuple[str,
         for other, found in document["alignments"].items()
         if found["accepted"] and name in (document["agent"], other)
     }
+
+
+def set_realtime(pid: int) -> None:
+    """Real-time priority for all threads of a process."""
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
 
 
 def free_ports(number: int) -> list[int]:
