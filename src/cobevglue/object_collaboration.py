@@ -69,10 +69,10 @@ class ObjectCollaboration:
         self._latest: dict[str, tuple[float, Boxes]] = {}
 
     def forget(self, agent: str) -> None:
-        """Forget the tracks and the pose of one agent: its next list is its first."""
+        """Forget the tracks and the pose of one agent: its next list does not continue its last one."""
         self.aligner.forget(agent)
-        self._trackers.pop(agent, None)
         self._latest.pop(agent, None)
+        self._trackers.pop(agent, None)
 
     def step(
         self,

@@ -87,7 +87,7 @@ class BEVGlueGroup(GroupAligner):
         self._aligners.clear()
 
     def forget(self, agent: str) -> None:
-        """Forget all pairs with this agent."""
+        """Forget the pairs with this agent."""
         self._aligners = {pair: aligner for pair, aligner in self._aligners.items() if agent not in pair}
 
     def _judge(self, direct: Alignment, found: _Pose, ego: Boxes, other: Boxes, names: list[str]) -> Alignment:

@@ -77,8 +77,8 @@ class GroupAligner(ABC):
     def reset(self) -> None:  # noqa: B027  # not abstract: most have no state
         """Forget all frames; does nothing for aligners without a state."""
 
-    def forget(self, agent: str) -> None:  # noqa: B027  # likewise
-        """Forget one collaborator; does nothing for aligners without a state."""
+    def forget(self, agent: str) -> None:  # noqa: B027
+        """Forget what is known of one other agent; does nothing for aligners without a state."""
 
     def select_inputs(self, observation: Observation) -> Observation:
         """The part of an observation that this aligner uses.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -59,10 +59,12 @@ def align(
     if picture is not None:
         _draw(picture, pairs[-1], last)
     if as_json:
-        document = _document(last)
+        from cobevglue.alignment.to_dict import alignment_to_dict
+
+        document = alignment_to_dict(last)
         if ego.is_dir():
             document["frames"] = [
-                {"name": pair.name, "time": pair.time, **_document(found)}
+                {"name": pair.name, "time": pair.time, **alignment_to_dict(found)}
                 for pair, found in zip(pairs, alignments, strict=True)
             ]
         print_json(document)
@@ -78,22 +80,6 @@ def _glue(paper: bool) -> BEVGlue:
     from cobevglue.alignment import BEVGlue, BEVGlueConfig
 
     return BEVGlue(BEVGlueConfig.paper()) if paper else BEVGlue()
-
-
-def _document(alignment: Alignment) -> dict[str, Any]:
-    """JSON document of an alignment: metres and radians; degrees where the key ends in `_deg`."""
-    pose = alignment.ego_SE2_other
-    return {
-        "accepted": bool(alignment.accepted),
-        "reason": alignment.reason,
-        "ego_SE2_other": None
-        if pose is None
-        else {"x": pose.x, "y": pose.y, "yaw": pose.yaw, "yaw_deg": math.degrees(pose.yaw)},
-        "covariance": None if pose is None else alignment.covariance.tolist(),
-        "matches": alignment.matches.tolist(),
-        "evidence": float(alignment.evidence),
-        "margin": float(alignment.margin),
-    }
 
 
 def _print_verdict(pair: FramePair, alignment: Alignment) -> None:

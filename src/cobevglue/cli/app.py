@@ -18,6 +18,7 @@ from cobevglue.cli.errors import InputError
 from cobevglue.cli.evaluate import evaluate
 from cobevglue.cli.node import node
 from cobevglue.cli.output import print_note
+from cobevglue.cli.replay import replay
 from cobevglue.cli.reproduce import reproduce
 from cobevglue.cli.simulate import simulate
 from cobevglue.cli.train import train
@@ -45,7 +46,7 @@ def _reflowed(text: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n"))
 
 
-for _command in (demo, align, simulate, train, evaluate, reproduce, bench, node):
+for _command in (demo, align, simulate, train, evaluate, reproduce, bench, replay, node):
     app.command(help=_reflowed(_command.__doc__ or ""))(_command)
 
 

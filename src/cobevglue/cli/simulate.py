@@ -25,6 +25,7 @@ class Format(str, Enum):
     OPV2V = "opv2v"
     V2V4REAL = "v2v4real"
     DAIR_V2X = "dair-v2x"
+    MCAP = "mcap"
 
 
 class Split(str, Enum):
@@ -73,8 +74,17 @@ def simulate(
     numbers of points. --format v2v4real has two vehicles, dair-v2x one vehicle and a roadside unit. The same options
     give the same files, and the same command resumes an interrupted run.
 
-    Needs: pip install 'cobevglue[simulation]'
+    --format mcap writes a ROS 2 bag with object lists of --agents vehicles at a junction, for `cobevglue replay`:
+    detections with errors, without clouds, of different instants. Only --frames and --seed apply to it.
+
+    Needs: pip install 'cobevglue[simulation]', and 'cobevglue[ros]' for mcap
     """
+    if kind is Format.MCAP:
+        for option, given in (("--split", split), ("--network", network), ("--roadside-units", roadside_units)):
+            if given is not None:
+                raise InputError(f"{option}: not for --format mcap")
+        _write_bag(out, frames, agents or 2, seed, as_json)
+        return
     _require_extra()
     from cobevglue.simulation.export import export
     from cobevglue.simulation.layouts import LAYOUTS, Task
@@ -112,6 +122,19 @@ def simulate(
             f"{out}: {scenarios} x {frames} frames of {settings.agents + settings.roadside_units} agents, "
             f"{report.frames_written} written, {report.frames_kept} existed already"
         )
+
+
+def _write_bag(out: Path, frames: int, agents: int, seed: int, as_json: bool) -> None:
+    if find_spec("rosbags") is None:
+        raise InputError("--format mcap needs rosbags: pip install 'cobevglue[ros]'")
+    from cobevglue.simulation.recording import write_recording
+
+    with expected_errors():
+        topics = write_recording(out, seed, frames, agents)
+    if as_json:
+        print_json({"root": str(out), "format": Format.MCAP.value, "topics": topics})
+    else:
+        print(f"{out}: a ROS 2 bag with {frames} lists on each of {', '.join(topics)}")
 
 
 def _require_extra() -> None:

@@ -52,13 +52,16 @@ def open_recording(path: str | Path, name: str = "cobevglue") -> Iterator[Record
 
     Raises:
         ModuleNotFoundError: rerun-sdk is not installed.
-        OSError: the folder does not exist.
+        OSError: the folder does not exist, or the file cannot be written.
     """
     rr = _rerun()
     if not Path(path).parent.is_dir():
         raise FileNotFoundError(f"{Path(path).parent} does not exist")
     recording = rr.RecordingStream(name)
-    recording.save(str(path))
+    try:
+        recording.save(str(path))
+    except RuntimeError as error:  # such as a full disk
+        raise OSError(f"{path}: {error}") from None
     try:
         recording.log("/", rr.ViewCoordinates.FLU, static=True)
         yield recording

@@ -1,0 +1,169 @@
+"""From the messages of a topic to object lists: objects, point clouds through the detector, or messages of others."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cobevglue.boxes import Boxes
+from cobevglue.interop.ros import boxes_from_ros, points_from_ros, stamp_from_ros
+from cobevglue.messages import MessageError, ObjectMessage, decode
+from cobevglue.recordings import Topic
+from cobevglue.replay.topics import CLOUDS, MESSAGES
+
+if TYPE_CHECKING:
+    from cobevglue.perception import Perception, PointPillars
+
+__all__ = ["Content", "Source", "make_source"]
+
+_FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm"})
+_FARTHEST, _LARGEST = 10_000.0, 1_000.0
+"""Of the objects that an agent can see: distance and size [m]; beyond, they are not in its frame, or damaged."""
+_CPM_PORT = (2009).to_bytes(2, "big")
+"""Destination port of CPMs in the header of ETSI's basic transport protocol, which precedes them in packets."""
+_OBJECT_MESSAGE = b"CBVG"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Content:
+    """What a message says.
+
+    Attributes:
+        boxes: in the agent's frame; with track ids only if the sender gives them.
+        body: one-row box of the agent's own vehicle, or None.
+        without_size: number of objects left out, since their size is unknown.
+        new_identities: the track ids have nothing to do with those of earlier messages.
+    """
+
+    boxes: Boxes
+    body: Boxes | None = None
+    without_size: int = 0
+    new_identities: bool = False
+
+
+class Source(ABC):
+    """Reads the messages of one topic, in order."""
+
+    def __init__(self, agent: str) -> None:
+        self.agent = agent
+
+    @abstractmethod
+    def sender(self, message: Any) -> tuple[str, float]:
+        """The agent, and the time stamp of its list [s]; 0 for "not set"."""
+
+    @abstractmethod
+    def content(self, message: Any, time: float) -> Content:
+        """The objects of a message, which were seen at `time` [s].
+
+        Raises:
+            ValueError: a bad value; names field and row.
+        """
+
+
+class _Objects(Source):
+    """Object lists; their identities are used as long as all objects have one."""
+
+    def __init__(self, agent: str) -> None:
+        super().__init__(agent)
+        self._numbers: dict[str, int] | None = {}
+
+    def sender(self, message: Any) -> tuple[str, float]:
+        _check_frame(message)
+        return self.agent, stamp_from_ros(message)
+
+    def content(self, message: Any, time: float) -> Content:
+        found = boxes_from_ros(message, self._numbers)
+        _check_boxes(found.boxes)
+        drops = self._numbers is not None and len(found.boxes) > 0 and found.boxes.track_id is None
+        were_used = bool(self._numbers)
+        if drops:
+            self._numbers = None
+        return Content(found.boxes, without_size=found.without_size, new_identities=drops and were_used)
+
+
+class _Clouds(Source):
+    """Point clouds through the detector and its tracker."""
+
+    def __init__(self, agent: str, detector: PointPillars) -> None:
+        super().__init__(agent)
+        self._detector, self._perception = detector, _perception(detector)
+        self._last = float("-inf")
+
+    def sender(self, message: Any) -> tuple[str, float]:
+        _check_frame(message)
+        return self.agent, stamp_from_ros(message)
+
+    def content(self, message: Any, time: float) -> Content:
+        if time <= self._last:  # the clock was set back
+            self._perception = _perception(self._detector)
+        self._last = time
+        seen = self._perception.step(points_from_ros(message), time)
+        boxes = seen.boxes.replace(center=seen.boxes.center - (0.0, 0.0, seen.height_correction))
+        return Content(boxes)
+
+
+class _Messages(Source):
+    """CPMs and our own messages, as bytes. The agents are the stations."""
+
+    def sender(self, message: Any) -> tuple[str, float]:
+        self._latest = message, _decoded(bytes(bytearray(message.data)))
+        return self._latest[1].agent_id, self._latest[1].time
+
+    def content(self, message: Any, time: float) -> Content:
+        decoded = self._latest[1] if self._latest[0] is message else _decoded(bytes(bytearray(message.data)))
+        _check_boxes(decoded.boxes)
+        return Content(decoded.boxes, decoded.body)
+
+
+def make_source(agent: str, topic: Topic, detector: PointPillars | None) -> Source:
+    """The source for a topic.
+
+    Args:
+        agent: whose topic it is.
+        topic: of a type in `cobevglue.replay.topics`.
+        detector: for point clouds.
+    """
+    if topic.type in CLOUDS:
+        assert detector is not None
+        return _Clouds(agent, detector)
+    return _Messages(agent) if topic.type in MESSAGES else _Objects(agent)
+
+
+def _decoded(data: bytes) -> ObjectMessage:
+    """The object message in these bytes, or that of the CPM in them, with or without the header of its transport."""
+    if data.startswith(_OBJECT_MESSAGE):
+        return decode(data)
+    from cobevglue.messages import cpm
+
+    if data.startswith(_CPM_PORT):
+        data = data[4:]
+    try:
+        return cpm.decode(data).object_message()
+    except MessageError as error:
+        raise MessageError(f"neither a CPM nor a message of cobevglue: {error}") from None
+
+
+def _check_boxes(boxes: Boxes) -> None:
+    distance, size = np.abs(boxes.center).max(axis=1, initial=0.0), boxes.size.max(axis=1, initial=0.0)
+    for name, values, limit in (("center", distance, _FARTHEST), ("size", size, _LARGEST)):
+        if (values > limit).any():
+            row = int((values > limit).argmax())
+            hint = "; the list must be in the agent's own frame" if name == "center" else ""
+            raise ValueError(f"{name}: row {row} has {values[row]:.4g} m, at most {limit:g} m are possible{hint}")
+
+
+def _check_frame(message: Any) -> None:
+    frame = str(message.header.frame_id).strip("/")
+    if frame.rsplit("/", 1)[-1] in _FIXED_FRAMES:
+        raise ValueError(
+            f"frame_id: this is in the fixed frame {frame!r}; it must be in the agent's own frame, such as base_link"
+        )
+
+
+def _perception(detector: PointPillars) -> Perception:
+    from cobevglue.perception import Perception
+
+    return Perception(detector)
