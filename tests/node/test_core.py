@@ -246,11 +246,26 @@ def test_synchronised_clocks_can_be_required() -> None:
     assert receive(core, message_of("car3", 499.0), 2.0) == "other clock"
 
 
+@pytest.mark.parametrize("step", [1e-310, 1e-12, 1e-4, 1e-3, 0.01])
+def test_lists_that_follow_at_once(step: float) -> None:
+    """Found by the fuzzer: velocities over the shortest times are infinite."""
+    core = NodeCore("car1", 1)
+    cars = Boxes.concatenate([CARS, CARS.replace(center=CARS.center + [7.0, 20.0, 0.0])])
+    tracked = cars.replace(track_id=[1, 2, 3, 4])
+    for k in range(6):
+        time = step * (k + 1) if k < 5 else 0.5
+        moved = tracked.replace(center=tracked.center + [0.5 * (k % 2), 0.0, 0.0])
+        receive(core, message_of("car2", time, moved, sequence=k), 0.1 * k)
+        core.observe(OwnList(cars, 0.1 * k), 0.1 * k)
+        assert core.align(0.1 * k) is not None
+
+
 def test_own_list_that_is_late_is_refused() -> None:
     core = NodeCore("car1", 1)
     core.observe(OwnList(CARS, 10.0), 0.0)
-    with pytest.raises(ValueError, match="not later"):
-        core.observe(OwnList(CARS, 9.9), 0.1)
+    for late in (9.9, 10.0, 10.0 + 1e-9):
+        with pytest.raises(ValueError, match="not later"):
+            core.observe(OwnList(CARS.replace(track_id=[1, 2]), late), 0.1)
     core.observe(OwnList(CARS, 10.1), 0.1)
     assert core.align(0.1) is not None
 
@@ -272,6 +287,14 @@ def test_own_track_ids_of_any_size_are_sent() -> None:
     ids = decode(sent.data).boxes.track_id
     assert ids is not None
     assert len(set(ids.tolist())) == 2
+
+
+def test_own_vehicle_is_sent_with_every_list() -> None:
+    body = CARS[:1].replace(center=[(0.5, 0.0, 0.0)])
+    core = NodeCore("car1", 1, body=body)
+    sent = [core.observe(OwnList(CARS, 0.0), 0.0), core.observe(OwnList(CARS, 0.1, CARS[:1]), 0.1)]
+    found = [decode(each.data).body for each in sent]
+    assert [each.center[0, 0] for each in found if each is not None] == [0.5, 10.0]
 
 
 def test_node_before_its_first_list() -> None:

@@ -207,6 +207,8 @@ def test_reader_that_goes_away_ends_it() -> None:
         (["car1", "--lists", "a//b"], "zenoh: "),
         (["car1", "--metrics", "{taken}"], "metrics: port"),
         (["car1", "--forget", "0"], "forget"),
+        (["car1", "--body", "4.5"], "--body: must be LENGTH,WIDTH"),
+        (["car1", "--body", "-4,2"], "--body: must be LENGTH,WIDTH"),
         (["car1", "--aligner", "bevglu"], "aligner"),
     ],
 )

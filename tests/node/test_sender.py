@@ -35,6 +35,7 @@ def sender_after(number: int, headers: bool = True) -> Sender:
         ((FIRST, 10), 1.0, 1.1, Admission("duplicate"), "the last one again"),
         ((FIRST, 7), 0.7, 1.1, Admission("duplicate"), "an earlier one again"),
         ((FIRST, 11), 1.0, 1.1, Admission("duplicate"), "the same list under another number"),
+        ((FIRST, 11), 1.0 + 1e-9, 1.1, Admission("duplicate"), "too near to be another list"),
         ((FIRST, 11), 1.1, 1.4, Admission(), "0.3 s later than the fastest"),
         ((FIRST, 11), 1.1, 1.7, Admission("late"), "0.6 s later than the fastest"),
         ((FIRST, 11), -50.0, 1.1, Admission(starts_anew="its clock was set"), "its clock was set back"),

@@ -19,6 +19,7 @@ from cobevglue.cli.errors import InputError, expected_errors
 from cobevglue.cli.output import print_note
 
 if TYPE_CHECKING:
+    from cobevglue.boxes import Boxes
     from cobevglue.node import NodeCore
     from cobevglue.node.inbox import Inbox
 
@@ -45,6 +46,10 @@ def node(
     lists: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="Take the own lists from a topic instead of standard input.")
     ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option(metavar="L,W[,X[,Y]]", help="Length and width of the own vehicle, and where its middle is [m]."),
+    ] = None,
     metrics: Annotated[
         int | None,
         typer.Option(metavar="PORT", min=0, max=65535, help="Serve metrics at http://127.0.0.1:PORT/metrics."),
@@ -56,8 +61,8 @@ def node(
     """Run a live agent: send its object lists, align with the others, publish alignments and fused objects.
 
     The own object lists are lines of JSON on standard input: an object list as for `align`, with "time" [s] (by default
-    the time at which it arrives) and "body", the own vehicle's box (optional). A list that cannot be used is reported
-    and skipped.
+    the time at which it arrives) and, where it is not always the same, "body", the own vehicle's box. A list that
+    cannot be used is reported and skipped.
 
     Without --listen, --connect or --router, nodes find each other by multicast. The topics are
     cobevglue/AGENT/objects, alignments and fused.
@@ -75,7 +80,7 @@ def node(
     with ExitStack() as stack:
         with expected_errors(), _missing_package():
             settings = NodeSettings.model_validate({"forget": forget, "aligner": aligner})
-            core = NodeCore(agent, new_session(), settings)
+            core = NodeCore(agent, new_session(), settings, None if body is None else _own_vehicle(body))
             config = zenoh_config(listen or (), connect or (), router, zenoh)
             if metrics is not None:
                 port = stack.enter_context(serve_metrics(page, metrics))
@@ -94,6 +99,15 @@ def node(
         status.end()
     if not core.metrics.value("lists_total") and core.metrics.value("lists_refused_total"):
         raise InputError("standard input: no object list could be used")
+
+
+def _own_vehicle(text: str) -> Boxes:
+    from cobevglue.cli.body_option import parse_body
+
+    try:
+        return parse_body(text)
+    except ValueError:
+        raise InputError(f"--body: must be LENGTH,WIDTH or LENGTH,WIDTH,X,Y, got {text!r}") from None
 
 
 def _print_line(document: dict[str, Any]) -> None:

@@ -93,7 +93,7 @@ def _note(done: int, total: int) -> None:
 
 def _bodies(given: list[str], made: Replay) -> dict[str, Boxes]:
     """Own vehicles from texts such as car1=4.5,1.9."""
-    from cobevglue.boxes import Boxes
+    from cobevglue.cli.body_option import parse_body
     from cobevglue.datasets.frame import did_you_mean
 
     bodies = {}
@@ -102,8 +102,7 @@ def _bodies(given: list[str], made: Replay) -> dict[str, Boxes]:
         if agent not in made.topics:
             raise InputError(f"--body: there is no agent {did_you_mean(agent, made.topics)}")
         try:
-            length, width, x, y = ([float(number) for number in numbers.split(",")] + [0.0, 0.0])[:4]
-            bodies[agent] = Boxes([(x, y, 0.0)], [(length, width, 1.5)], [0.0])
+            bodies[agent] = parse_body(numbers)
         except ValueError:
             raise InputError(f"--body: must be AGENT=LENGTH,WIDTH or AGENT=LENGTH,WIDTH,X,Y, got {text!r}") from None
     return bodies

@@ -25,7 +25,7 @@ from cobevglue.boxes import Boxes
 from cobevglue.messages import MAX_TRACK_ID, VERSION, MessageError, ObjectMessage, decode, encode
 from cobevglue.node.metrics import Metrics
 from cobevglue.node.own_list import OwnList
-from cobevglue.node.sender import Sender
+from cobevglue.node.sender import SAME_INSTANT, Sender
 from cobevglue.node.session_header import MAX_SEQUENCE, SessionHeader, UnknownVersionError, decode_header, encode_header
 from cobevglue.object_collaboration import ObjectCollaboration
 from cobevglue.settings import Settings
@@ -125,6 +125,10 @@ class NodeCore:
         agent: its id, as in an `ObjectMessage`.
         session: a number that grows with every start: `new_session()`.
         settings: of the node.
+        body: one-row box of the own vehicle in its own frame, for own lists that come without one; or None.
+
+    Raises:
+        MessageError: the id is not printable or too long, or `body` has not one row.
 
     Attributes:
         metrics: what happened so far.
@@ -132,8 +136,11 @@ class NodeCore:
         verdicts: of the last alignment, by agent: "accepted" or "refused".
     """
 
-    def __init__(self, agent: str, session: int, settings: NodeSettings | None = None) -> None:
-        ObjectMessage(agent, 0.0, 0, Boxes.empty())  # raises MessageError if the id cannot be sent
+    def __init__(
+        self, agent: str, session: int, settings: NodeSettings | None = None, body: Boxes | None = None
+    ) -> None:
+        ObjectMessage(agent, 0.0, 0, Boxes.empty(), body)  # raises MessageError if these cannot be sent
+        self._body = body
         self.agent, self.session = agent, session
         self.settings = settings or NodeSettings()
         self.metrics = Metrics()
@@ -161,15 +168,15 @@ class NodeCore:
         problem = self._implausible(own.boxes) or self._implausible(own.body)
         if problem:
             raise ValueError(f"object list: {problem}")
-        if self._own is not None and own.time <= self._own.time:
+        if self._own is not None and own.time < self._own.time + SAME_INSTANT:
             if own.time > self._own.time - _OWN_CLOCK_SET:
                 raise ValueError(f"object list: time {own.time} s is not later than the last one's, {self._own.time} s")
             self._start_anew(own.time)
-        tracked = self._tracked(own)
-        message = encode(ObjectMessage(self.agent, own.time, self._sequence, tracked, own.body))
+        tracked, body = self._tracked(own), self._body if own.body is None else own.body
+        message = encode(ObjectMessage(self.agent, own.time, self._sequence, tracked, body))
         header = encode_header(SessionHeader(self.session, self._sequence), message)
         self._sequence = (self._sequence + 1) % (MAX_SEQUENCE + 1)
-        self._own = OwnList(tracked, own.time, own.body)
+        self._own = OwnList(tracked, own.time, body)
         self._note_arrival(now)
         self.metrics.count("lists_total")
         self.metrics.count("sent_bytes_total", len(message) + len(header))

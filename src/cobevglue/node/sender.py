@@ -11,7 +11,7 @@ from typing import Literal
 
 from cobevglue.node.session_header import SessionHeader
 
-__all__ = ["Admission", "DelayFloor", "Sender"]
+__all__ = ["SAME_INSTANT", "Admission", "DelayFloor", "Sender"]
 
 _WINDOW = 64
 """Sequence numbers behind the newest that are known to have arrived or not."""
@@ -19,6 +19,8 @@ _FLOOR_PERIOD = 30.0
 """The shortest delay is that of the last 30 to 60 s, so that clocks may drift [s]."""
 _CLOCK_JUMP = 1.0
 """A message that arrives so much earlier than its time stamp lets expect: the clock was set forward [s]."""
+SAME_INSTANT = 1e-3
+"""Lists whose time stamps differ by less are one [s]."""
 _RIVAL_MESSAGES, _RIVAL_TIME = 5, 1.0
 """So many messages over so long [s] of another session beside the current one are no stragglers."""
 _NO_HEADER = SessionHeader(0, 0)
@@ -120,11 +122,12 @@ class Sender:
             self._note_rival(key.session, key.sequence if header else time, now)
             return Admission("old session" if key.session < self.session else "second agent")
         self.heard = now
-        behind = self._sequence - key.sequence if header else (0 if time == self._time else self._time - time)
+        behind = self._sequence - key.sequence if header else self._time - time
         if header and behind >= 0:
             return Admission("duplicate" if self._arrived_before(int(behind)) else "out of order")
-        if time == self._time or (not header and behind > 0):
-            return Admission("duplicate" if time == self._time else "out of order")
+        same_instant = abs(time - self._time) < SAME_INSTANT
+        if same_instant or (not header and behind > 0):
+            return Admission("duplicate" if same_instant else "out of order")
         if header:
             self._advance(key.sequence)
         before, self._time = self._time, time
