@@ -3,6 +3,7 @@
 python examples/live_lists.py car1 60 | cobevglue node car1 --listen tcp/127.0.0.1:7447
 """
 
+import contextlib
 import sys
 import time
 
@@ -17,9 +18,10 @@ def main(agent: str = "car1", seconds: str = "2") -> None:
     while tick < begin + 10 * float(seconds):
         time.sleep(max(0.0, tick / 10 - time.time()))
         view = frames[tick % len(frames)].agents[agent]
-        print(write_list(OwnList(view.boxes, time.time(), view.body)), flush=True)
+        print(write_list(OwnList(view.boxes, tick / 10, view.body)), flush=True)
         tick += 1
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    with contextlib.suppress(BrokenPipeError, KeyboardInterrupt):
+        main(*sys.argv[1:])

@@ -182,6 +182,17 @@ def test_own_lists_from_a_topic(run_node: Callable[..., LiveNode]) -> None:
     assert node.end() == 0
 
 
+def test_node_waits_for_its_router(run_node: Callable[..., LiveNode]) -> None:
+    router, scene = free_endpoint(), Scene()
+    car2 = run_node("car2", "--router", router, "--json")
+    car2.wait_for(lambda: car2.printed("trying again"))
+    car1 = run_node("car1", "--listen", router)  # to one other node, it is as good as a router
+    car2.wait_for(lambda: "car1" in car2.last().get("alignments", {}), lambda: scene.feed(car1, car2))
+    alone = run_node("car3", "--router", free_endpoint())
+    alone.wait_for(lambda: alone.printed("trying again"))
+    assert alone.end(signal.SIGINT) == 2
+
+
 def test_reader_that_goes_away_ends_it() -> None:
     node = f"{sys.executable} -m cobevglue node car1 --listen {free_endpoint()} --json"
     process = subprocess.run(

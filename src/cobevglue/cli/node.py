@@ -48,7 +48,7 @@ def node(
     ] = None,
     body: Annotated[
         str | None,
-        typer.Option(metavar="L,W[,X[,Y]]", help="Length and width of the own vehicle, and where its middle is [m]."),
+        typer.Option(metavar="L,W[,X[,Y]]", help="Length and width of the own vehicle, and its middle, in metres."),
     ] = None,
     metrics: Annotated[
         int | None,
@@ -60,9 +60,9 @@ def node(
 ) -> None:
     """Run a live agent: send its object lists, align with the others, publish alignments and fused objects.
 
-    The own object lists are lines of JSON on standard input: an object list as for `align`, with "time" [s] (by default
-    the time at which it arrives) and, where it is not always the same, "body", the own vehicle's box. A list that
-    cannot be used is reported and skipped.
+    The own object lists are lines of JSON on standard input: an object list as for `align`, with "time" in seconds (by
+    default the time at which it arrives) and, where it is not always the same, "body", the own vehicle's box. A list
+    that cannot be used is reported and skipped.
 
     Without --listen, --connect or --router, nodes find each other by multicast. The topics are
     cobevglue/AGENT/objects, alignments and fused.
@@ -76,6 +76,13 @@ def node(
     from cobevglue.node.network import connect as connected
     from cobevglue.node.network import zenoh_config
 
+    def wait(error: str) -> bool:
+        print_note(f"{error}; trying again")
+        return not stop.wait(_EVERY_SECOND)
+
+    def give_up(_error: str) -> bool:
+        return False
+
     inbox, page, stop = Inbox(), MetricsPage(), threading.Event()
     with ExitStack() as stack:
         with expected_errors(), _missing_package():
@@ -88,7 +95,7 @@ def node(
             warm_up()
             page.text = core.metrics.text()
             stack.enter_context(_ended_by_signals(stop))
-            network = stack.enter_context(connected(agent, config, inbox, lists))
+            network = stack.enter_context(connected(agent, config, inbox, lists, wait if router else give_up))
         stack.enter_context(nullcontext() if lists is not None else _standard_input(inbox, stop))
         status = _StatusLine(core)
         print_note(f"{agent}: ready")

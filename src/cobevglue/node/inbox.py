@@ -34,7 +34,7 @@ class Inbox:
         lists: that wait at most.
     """
 
-    def __init__(self, messages: int = 512, lists: int = 4) -> None:
+    def __init__(self, messages: int = 512, lists: int = 2) -> None:
         self._ready = threading.Condition()
         self._messages: deque[Received] = deque(maxlen=messages)
         self._lists: deque[ListLine] = deque(maxlen=lists)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,7 +101,13 @@ class Network:
 
 
 @contextmanager
-def connect(agent: str, config: Config, inbox: Inbox, lists_topic: str | None = None) -> Iterator[Network]:
+def connect(
+    agent: str,
+    config: Config,
+    inbox: Inbox,
+    lists_topic: str | None = None,
+    try_again: Callable[[str], bool] = lambda error: False,
+) -> Iterator[Network]:
     """A session until the block ends.
 
     Args:
@@ -109,6 +115,7 @@ def connect(agent: str, config: Config, inbox: Inbox, lists_topic: str | None = 
         config: from `zenoh_config`.
         inbox: for what arrives.
         lists_topic: topic of the own lists, one JSON document each; None if they come otherwise.
+        try_again: whether to try again when the session cannot be opened; gets the reason.
 
     Raises:
         ValueError: the session cannot be opened, for example because the port is in use, or a topic is not valid.
@@ -117,10 +124,11 @@ def connect(agent: str, config: Config, inbox: Inbox, lists_topic: str | None = 
     zenoh = _zenoh()
     if not agent or _NOT_IN_TOPICS & set(agent):
         raise ValueError(f"agent id: {agent!r} cannot be part of a topic: without {' '.join(sorted(_NOT_IN_TOPICS))}")
-    try:
-        session = zenoh.open(config)
-    except zenoh.ZError as error:
-        raise ValueError(f"zenoh: {_one_line(error)}") from None
+    session, error = _opened(config)
+    while session is None and try_again(error):
+        session, error = _opened(config)
+    if session is None:
+        raise ValueError(error)
     try:
         try:
             network = Network(session, agent, inbox, lists_topic)
@@ -129,6 +137,15 @@ def connect(agent: str, config: Config, inbox: Inbox, lists_topic: str | None = 
         yield network
     finally:
         session.close()
+
+
+def _opened(config: Config) -> tuple[Any, str]:
+    """A session, or None and why."""
+    zenoh = _zenoh()
+    try:
+        return zenoh.open(config), ""
+    except zenoh.ZError as error:
+        return None, f"zenoh: {_one_line(error)}"
 
 
 def _one_line(error: Exception) -> str:
