@@ -145,6 +145,32 @@ def test_silent_agent_is_forgotten() -> None:
     assert any("car2: silent" in event for event in drive.ego.events)
 
 
+def test_agents_that_went_leave_nothing_behind() -> None:
+    core = NodeCore("car1", 1, NodeSettings(forget=0.15))
+    for k in range(50):
+        now = 0.1 * k
+        assert receive(core, message_of(f"agent{k}", now), now) == ""
+        core.observe(OwnList(CARS, now), now)
+        core.align(now)
+    collaboration = core._collaboration
+    assert len(collaboration._trackers) <= 2
+    assert len(collaboration._latest) <= 3
+    assert len(vars(collaboration.aligner)["_aligners"]) <= 2
+
+
+def test_stamps_tell_the_age_of_a_list() -> None:
+    """The other's lists are of 0.2 s ago, and their stamps say so; nothing that is seen in these frames could."""
+    core = NodeCore("car1", 1)
+    still = Boxes.concatenate([CARS, CARS.replace(center=CARS.center + [7.0, 20.0, 0.0])])
+    for k in range(10):
+        now = 0.1 * k
+        receive(core, message_of("car2", now - 0.2, still, sequence=k), now)
+        core.observe(OwnList(still, now), now)
+        result = core.align(now)
+    assert result is not None
+    assert result.alignments["car2"].time_offset == pytest.approx(-0.2, abs=0.01)
+
+
 def test_link_that_becomes_slow_is_refused() -> None:
     drive = Drive()
     drive.run(10)
