@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
+from torch import nn
 
 from cobevglue.alignment import Alignment, group_aligner
 from cobevglue.alignment.group import GroupAligner, Observation
@@ -23,6 +24,7 @@ from cobevglue.fusion.heading import vote_headings
 from cobevglue.fusion.none import NoCollaboration
 from cobevglue.messages import decode_arrays, encode_arrays
 from cobevglue.perception import Perception, PerceptionOutput, PointPillars
+from cobevglue.perception.fold_batch_norm import fold_batch_norm
 from cobevglue.typing import ArrayLike, FloatArray
 
 __all__ = ["CoBEVGlue", "StepOutput"]
@@ -79,7 +81,8 @@ class CoBEVGlue:
         """
         detector = PointPillars.pretrained(name)
         method = pretrained_fusion(fusion, detector, name)
-        return cls(detector, method, group_aligner(aligner or method.usual_aligner))
+        folded = fold_batch_norm(method) if isinstance(method, nn.Module) else method
+        return cls(fold_batch_norm(detector), folded, group_aligner(aligner or method.usual_aligner))
 
     def reset(self) -> None:
         """Forget all tracks and poses: the next frame is the first of another sequence."""

@@ -153,6 +153,52 @@ def test_new_track_id_begins_at_rest() -> None:
     np.testing.assert_allclose(velocity[:, 2], TrackNoise().speed ** 2)
 
 
+@pytest.mark.parametrize(
+    ("step", "start", "known", "is_vehicle"),
+    [
+        pytest.param(SE2(0.7, 0.0, 0.01), SE2(), False, True, id="forwards: a sensor on a vehicle"),
+        pytest.param(SE2(0.7, 0.05, 0.0), SE2(), False, True, id="a little sideways, as a sensor mounted askew"),
+        pytest.param(SE2(0.7, 0.5, 0.0), SE2(), False, False, id="sideways: no vehicle drives so"),
+        pytest.param(SE2(-0.7, 0.0, 0.0), SE2(), False, False, id="backwards"),
+        pytest.param(SE2(), SE2(), False, False, id="at rest: a map, or a mast"),
+        pytest.param(SE2(0.7, 0.0, 0.0), SE2(0.0, 400.0, 0.0), False, False, id="no sensor sees 400 m"),
+        pytest.param(SE2(0.7, 0.5, 0.0), SE2(), True, True, id="sideways, but the agent tells its own vehicle"),
+    ],
+)
+def test_frame_of_a_vehicle_is_told_from_others(step: SE2, start: SE2, known: bool, is_vehicle: bool) -> None:
+    motion, pose = FrameMotion(), start
+    for k in range(40):
+        boxes = observed(0.1 * k, pose, 3)
+        motion.velocities(box_rows(boxes), track_ids(boxes), 0.1, known)
+        pose = pose @ step
+    assert motion.is_vehicle is is_vehicle
+
+
+def test_frame_of_no_vehicle_is_not_extrapolated() -> None:
+    """The other's objects are 0.2 s old, but its frame, which slides sideways, is of the ego's instant."""
+    glue = BEVGlue()
+    for k in range(FRAMES):
+        time = 1.0 + 0.1 * k
+        world_SE2_other = SE2(5.0 + 0.4 * k, 0.9 * k - 10.0, 0.3)
+        alignment = glue.align(observed(time, WORLD_SE2_EGO, 0), observed(time - 0.2, world_SE2_other, 1), time)
+    assert alignment.ego_SE2_other is not None
+    assert alignment.ego_SE2_other == alignment.ego_SE2_list
+    assert alignment.ego_SE2_other.error_to(WORLD_SE2_EGO.inverse() @ world_SE2_other)[0] < 0.5
+    assert alignment.time_offset == pytest.approx(-0.2, abs=0.04)
+
+
+@pytest.mark.parametrize(("detections", "speed"), [(2, 0.0), (3, 35.0), (4, 35.0)])
+def test_velocity_takes_three_detections(detections: int, speed: float) -> None:
+    """Two detections 3.5 m apart are often two objects under one track id."""
+    motion = FrameMotion()
+    parked = vehicles(0.0)[SPEEDS == 0.0]
+    for k in range(10 + detections):
+        fast = Boxes([(3.5 * (k - 10), 6.0, 0.0)], [(4.5, 1.9, 1.6)], [0.0], track_id=[99])
+        boxes = Boxes.concatenate([parked, fast]) if k >= 10 else parked
+        velocity = motion.velocities(box_rows(boxes), track_ids(boxes), 0.1)
+    assert velocity[-1, 0] == pytest.approx(speed, abs=2.0)
+
+
 def test_rows_in_another_order_change_nothing() -> None:
     lists = [observed(t, world_SE2_other(t), 1) for t in 0.1 * np.arange(8)]
     order = np.random.default_rng(0).permutation(len(SPEEDS))

@@ -31,23 +31,37 @@ SURE = 1e4
 def test_risk_is_one_minus_posterior(
     evidence: float, margin: float, landing_std: float, risk: float, reason: str
 ) -> None:
-    verdict = judge(evidence, margin, landing_std, 3, 10, CONFIG)
+    verdict = judge(evidence, margin, math.inf, landing_std, 3, 10, CONFIG)
     assert verdict.risk == pytest.approx(risk, abs=2e-3)
     assert verdict.reason.startswith(reason)
     assert bool(verdict.reason) is (verdict.risk >= CONFIG.risk)
 
 
 def test_no_matched_pair_is_refused() -> None:
-    verdict = judge(SURE, SURE, 0.1, 0, 10, CONFIG)
+    verdict = judge(SURE, SURE, math.inf, 0.1, 0, 10, CONFIG)
     assert verdict.risk == 1.0
     assert verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("frame_margin", "accepted"),
+    [
+        pytest.param(math.inf, True, id="no different pose"),
+        pytest.param(-8.0, True, id="one frame of a queue fits another pose by chance"),
+        pytest.param(-15.0, False, id="the frame turned by 12 degrees at once and fits the pose after that"),
+    ],
+)
+def test_jump_of_the_frame_is_refused(frame_margin: float, accepted: bool) -> None:
+    verdict = judge(SURE, SURE, frame_margin, 0.1, 3, 10, BEVGlueConfig())
+    assert bool(verdict.reason) is not accepted
+    assert verdict.reason.startswith("" if accepted else "a jump: a different pose fits this frame alone")
 
 
 def test_regular_pattern_stays_ambiguous() -> None:
     """Eight of nine equal gaps also fit the pose shifted by one: the margin is 1/9 of the evidence."""
     config = BEVGlueConfig()
-    assert judge(36.0, 4.0, 0.3, 9, 100, config).reason.startswith("ambiguous")
-    assert not judge(36.0, 30.0, 0.3, 9, 100, config).reason
+    assert judge(36.0, 4.0, math.inf, 0.3, 9, 100, config).reason.startswith("ambiguous")
+    assert not judge(36.0, 30.0, math.inf, 0.3, 9, 100, config).reason
 
 
 @given(st.floats(0.01, 20.0), st.floats(0.1, 10.0))
@@ -58,6 +72,6 @@ def test_landing_risk_is_normal_tail(landing_std: float, tolerance: float) -> No
 @given(st.floats(-5.0, 60.0), st.floats(0.0, 60.0), st.floats(0.05, 5.0), st.integers(1, 100))
 def test_more_evidence_never_raises_risk(evidence: float, margin: float, landing_std: float, frames: int) -> None:
     """With the same different pose, so that the margin grows by as much."""
-    before = judge(evidence, margin, landing_std, 3, frames, BEVGlueConfig()).risk
-    after = judge(evidence + 1.0, margin + 1.0, landing_std, 3, frames, BEVGlueConfig()).risk
+    before = judge(evidence, margin, math.inf, landing_std, 3, frames, BEVGlueConfig()).risk
+    after = judge(evidence + 1.0, margin + 1.0, math.inf, landing_std, 3, frames, BEVGlueConfig()).risk
     assert 0.0 < after <= before <= 1.0

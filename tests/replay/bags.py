@@ -38,7 +38,7 @@ def write_bag(
     sqlite: bool = False,
     definitions: Mapping[str, str] | None = None,
     with_definitions: bool = True,
-    topics: Iterable[tuple[str, str]] = (),
+    compressed: str = "none",
 ) -> Path:
     """A ROS 2 bag.
 
@@ -48,12 +48,14 @@ def write_bag(
         sqlite: store it in SQLite in place of MCAP.
         definitions: of types that ROS 2 Humble has not.
         with_definitions: False for a bag in SQLite as ROS 2 Humble and older write it.
-        topics: further topics with their types, without messages.
+        compressed: as rosbags names it: none, file, message or storage.
     """
     store = store_of(LAYOUTS[0] if definitions is None else definitions)
     plugin = rosbag2.StoragePlugin.SQLITE3 if sqlite else rosbag2.StoragePlugin.MCAP
-    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in topics}
+    writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(rosbag2.CompressionMode[compressed.upper()], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
         for topic, kind, received, message in entries:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)

@@ -97,6 +97,12 @@ def test_every_kind_of_bag_is_read(tmp_path: Path, kind: str) -> None:
     assert [topic for topic, _, _ in read(path, "/b/objects")] == ["/b/objects"]
 
 
+@pytest.mark.parametrize("compressed", ["file", "message", "storage"])
+def test_compressed_bags_are_read(tmp_path: Path, compressed: str) -> None:
+    path = write_bag(tmp_path / "bag", TWO_TOPICS, sqlite=compressed != "storage", compressed=compressed)
+    assert [len(message.detections) for _, _, message in read(path)] == [1, 2, 0]
+
+
 def test_another_writer_and_reader_agree(tmp_path: Path) -> None:
     """What mcap-ros2-support writes is read here, and it reads what is written here."""
     pytest.importorskip("mcap_ros2", reason="the other reader and writer is mcap-ros2-support")
@@ -216,6 +222,28 @@ def test_what_is_no_recording_is_named(tmp_path: Path, name: str, content: Any, 
     path.write_bytes(content((tmp_path / "good" / "good.mcap").read_bytes()))
     with pytest.raises(ValueError, match=message):
         read(path)
+
+
+@pytest.mark.parametrize("sqlite", [False, True], ids=["MCAP", "SQLite"])
+def test_spoilt_bags_are_errors_or_readable(tmp_path: Path, sqlite: bool) -> None:
+    """Whatever bytes are changed: an error of one kind, or messages."""
+    good = write_bag(tmp_path / "good", TWO_TOPICS, sqlite=sqlite)
+    (path,) = [*good.glob("*.mcap"), *good.glob("*.db3")]
+    data = path.read_bytes()
+    readable = refused = 0
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 0, 0])
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), 3):
+            changed[place] = rng.integers(256)
+        (tmp_path / path.name).write_bytes(changed[: int(rng.integers(len(data)))] if seed % 10 == 0 else changed)
+        try:
+            for _, _, message in read(tmp_path / path.name, "/a/objects", "/b/objects"):
+                boxes_from_ros(message)
+            readable += 1
+        except ValueError:
+            refused += 1
+    assert min(readable, refused) > 0
 
 
 def test_folders_that_are_no_bags(tmp_path: Path) -> None:

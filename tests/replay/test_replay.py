@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from cobevglue import Boxes
+from cobevglue.evaluation.alignment_data import v2v4real_sequences
 from cobevglue.messages import ObjectMessage, encode
 from cobevglue.simulation import Junction, JunctionSettings
 
 pytest.importorskip("rosbags", reason="recordings need rosbags")
 
-from cobevglue.recordings import open_recording
+from cobevglue.recordings import new_detection_bag, open_recording
 from cobevglue.replay import Replay, ReplayFrame
 from cobevglue.simulation.recording import STAGGER, write_recording
 
@@ -124,7 +125,10 @@ def test_objects_without_size_are_counted(tmp_path: Path) -> None:
         (detections(1.2, detection(np.nan, 0)), "detections: center: row 0 is not finite"),
         (detections(1.2, detection(1, 0), detection(5.3e6, 0)), "center: row 1 has 5.3e.06 m, .* own frame"),
         (detections(1.2, {"bbox": {"center": pose(1, 0), "size": {"x": 9e9, "y": 1.0}}}), "size: row 0 has 9e.09 m"),
-        (detections(1.2, detection(1, 0), frame_id="car/map"), "frame_id: this is in the fixed frame 'car/map'"),
+        (
+            detections(1.2, detection(1, 0), frame_id="car/map"),
+            "frame_id: this is in the frame 'car/map', and there are no",
+        ),
     ],
     ids=["no orientation", "NaN", "coordinates of a map", "size", "a map"],
 )
@@ -218,6 +222,28 @@ def test_simulated_drive_is_aligned(tmp_path: Path) -> None:
         assert len(errors) >= 25
         assert np.median(errors) < 0.5
         assert np.median(offsets) == pytest.approx(STAGGER * number - 0.1, abs=0.03)
+
+
+def test_two_real_cars(tmp_path: Path, real_data: Path) -> None:
+    """Detections of two real cars, V2V4Real, in a bag: the lists of the other car show the world a little later."""
+    (sequence,) = v2v4real_sequences(real_data / "v2v4real_detections", ("val/0004",))
+    pairs = list(sequence.frames)
+    with new_detection_bag(tmp_path / "drive") as bag:
+        for index, pair in enumerate(pairs):
+            time = 50.0 + 0.1 * index
+            for name, boxes in (("other", pair.other), ("ego", pair.ego)):
+                bag.write(f"/{name}/objects", time, time, "lidar", boxes.replace(track_id=None))
+    with open_recording(tmp_path / "drive") as recording:
+        frames = run(Replay(recording, "/ego/objects", ["/other/objects"]))
+    found = [frame.seen.alignments["other"] for frame in frames]
+    near = [  # where the boxes of the other car come to lie
+        np.abs(each.ego_SE2_other.apply(pair.other.center) - pair.ego_SE2_other.apply(pair.other.center)).mean() < 1.5
+        for each, pair in zip(found, pairs, strict=True)
+        if each.ego_SE2_other is not None
+    ]
+    assert len(near) > 0.9 * len(pairs)
+    assert np.mean(near) > 0.95
+    assert 0.0 < np.median([each.time_offset for each in found]) < 0.2
 
 
 def turned(point: np.ndarray, yaw: float) -> np.ndarray:

@@ -60,7 +60,8 @@ class BEVGlue:
         """The relative pose in this frame, or a refusal with its reason.
 
         An agent's own vehicle is an object to the other agent, which no detector of its own reports. Where it is given,
-        it takes part like any box, and a pose that places one vehicle into the other is refused.
+        it takes part like any box, and a pose that places one vehicle into the other is refused. The paper's method
+        uses none of the keyword arguments.
 
         Args:
             ego: boxes in ego's frame, with track ids if there are any.
@@ -74,8 +75,9 @@ class BEVGlue:
                 It is one more pose to try and counts as little evidence, so that a false claim does no harm.
 
         The list of the collaborator may be of another instant: the offset is estimated from the velocities of its
-        tracks, and the pose is that at the ego's instant. With `BEVGlueConfig(time_offset=False)` the two lists are
-        taken to be of one instant.
+        tracks, and the pose is that at the ego's instant. The collaborator's frame is moved on if it moves like a
+        vehicle or comes with `other_body`; any other frame, such as a map's, is the same at both instants. With
+        `BEVGlueConfig(time_offset=False)` the two lists are taken to be of one instant.
 
         Returns:
             The pose with the matches of `ego` and `other`; matches of own vehicles are not listed.
@@ -92,9 +94,8 @@ class BEVGlue:
         claimed = None if prior is None else (prior[0], _checked_covariance(prior[1]))
         times = self._advance_clocks(time, other_time)
         if isinstance(self._matcher, PaperMatcher):
-            alignment = self._matcher.align(*with_bodies)
-        else:
-            alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
+            return self._matcher.align(ego, other)
+        alignment = self._matcher.align(*with_bodies, times, ego_body is not None, other_body is not None, claimed)
         return check_bodies(alignment, ego, other, ego_body, other_body)
 
     @property

@@ -109,9 +109,12 @@ class EvidenceMatcher:
         ego_rows, other_rows = box_rows(ego), box_rows(other)
         ego_count, other_count = len(ego) - ego_body, len(other) - other_body
         self._ego_motion.velocities(ego_rows[:ego_count], track_ids(ego)[:ego_count], times.ego_step)
+        was_vehicle = self._other_motion.is_vehicle
         velocity = self._other_motion.velocities(
-            other_rows[:other_count], track_ids(other)[:other_count], times.other_step
+            other_rows[:other_count], track_ids(other)[:other_count], times.other_step, other_body
         )
+        if self._other_motion.is_vehicle is not was_vehicle:
+            self._change_instant()
         if config.time_offset:
             other_rows[:other_count, 5:] = velocity  # the own vehicle does not move in its own frame
         expected_offset, offset_std = 0.0, 0.0
@@ -122,7 +125,7 @@ class EvidenceMatcher:
         claim = np.full((4, 3), np.inf)
         if prior is not None:
             claim[0], claim[1:] = (prior[0].x, prior[0].y, prior[0].yaw), prior[1]
-        self._hypotheses, margin, landing_std, pairs, x, y, yaw, offset, covariance = self._kernels.advance(
+        found = self._kernels.advance(
             self._hypotheses,
             ego_rows,
             other_rows,
@@ -135,6 +138,7 @@ class EvidenceMatcher:
             expected_offset,
             expected_offset - self._expected_offset,
             offset_std,
+            self._other_motion.is_vehicle,
             claim,
             self._seen,
             self._noise,
@@ -142,12 +146,13 @@ class EvidenceMatcher:
             config.tries,
             self._rounds,
         )
+        self._hypotheses, margin, frame_margin, landing_std, pairs, x, y, yaw, offset, covariance = found
         self._seen += 1
         self._expected_offset = expected_offset
         if not len(self._hypotheses):
             return Alignment.refused(_nothing_in_common(ego, other), evidence=0.0, margin=0.0, risk=1.0)
         evidence = float(self._hypotheses[0]["evidence"])
-        verdict = judge(evidence, margin, landing_std, len(pairs), self._seen, config)
+        verdict = judge(evidence, margin, frame_margin, landing_std, len(pairs), self._seen, config)
         if verdict.reason and config.verdict:
             return Alignment.refused(verdict.reason, evidence, margin, verdict.risk)
         pose = SE2(x, y, yaw)
@@ -163,9 +168,24 @@ class EvidenceMatcher:
             verdict.risk,
             time_offset=offset,
             time_offset_std=math.sqrt(max(covariance[3, 3], 0.0)),
-            ego_SE2_list=pose @ self._other_motion.before(-offset),
+            ego_SE2_list=pose @ self._other_motion.before(-offset) if self._other_motion.is_vehicle else pose,
             other_velocity=velocity,
         )
+
+    def _change_instant(self) -> None:
+        """Move the hypotheses to the other list's instant, or back, when its frame becomes or ceases to be a vehicle's.
+
+        A vehicle's frame is another one at the ego's instant; any other frame is the same.
+        """
+        motion = self._other_motion
+        for h in self._hypotheses:
+            pivot = np.array([[h["other_x"], h["other_y"]]])
+            arm_x, arm_y = SE2(0.0, 0.0, h["yaw"]).apply(pivot)[0]
+            pose = SE2(h["ego_x"] - arm_x, h["ego_y"] - arm_y, h["yaw"])
+            now_SE2_list = motion.before(-float(h["offset"]))
+            moved = pose @ (now_SE2_list.inverse() if motion.is_vehicle else now_SE2_list)
+            h["ego_x"], h["ego_y"] = moved.apply(pivot)[0]
+            h["yaw"] = moved.yaw
 
 
 def _nothing_in_common(ego: Boxes, other: Boxes) -> str:

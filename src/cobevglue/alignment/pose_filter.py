@@ -162,13 +162,15 @@ def _change_pose(h, change) -> None:
 
 
 @kernel(error_model="numpy")
-def _correct_turn_rate(h, turn_rate, variance) -> None:
+def _correct_turn_rate(h, turn_rate, variance, is_vehicle) -> None:
     """Kalman update with the relative turn rate that the two frames' motions imply, unless it contradicts the pose's.
 
     The velocities of the frames are not used: where most of what an agent sees drives along with it, the two agents
     may take different things for the ground.
     """
     total = h.cov[5, 5] + variance
+    if is_vehicle:
+        total += (_UNSEEN_TURN_ACCELERATION * h.offset) ** 2
     innovation = turn_rate - h.rate[2]
     if innovation * innovation > _SAME_TURN_RATE * total:
         return
@@ -325,14 +327,14 @@ def _remember(h, star, pairs, ego_ids, other_ids) -> None:
 
 
 @kernel(error_model="numpy")
-def _unseen_motion(h):
+def _unseen_motion(h, is_vehicle):
     """Variances of position and yaw from what other's vehicle did since its list and its tracks do not show."""
-    change = 0.25 * h.offset**4
+    change = 0.25 * h.offset**4 if is_vehicle else 0.0
     return _UNSEEN_ACCELERATION**2 * change, _UNSEEN_TURN_ACCELERATION**2 * change
 
 
 @kernel(error_model="numpy")
-def _at_origin(h):
+def _at_origin(h, is_vehicle):
     """x, y, yaw and the (4, 4) covariance of them and the offset, at the origin of other's frame."""
     cos, sin = math.cos(h.yaw), math.sin(h.yaw)
     rx, ry = cos * h.other_x - sin * h.other_y, sin * h.other_x + cos * h.other_y
@@ -345,7 +347,7 @@ def _at_origin(h):
             covariance[i, j] += factor * covariance[2, j]
         for j in range(4):
             covariance[j, i] += factor * covariance[j, 2]
-    shift, turn = _unseen_motion(h)
+    shift, turn = _unseen_motion(h, is_vehicle)
     covariance[0, 0] += shift
     covariance[1, 1] += shift
     covariance[2, 2] += turn
@@ -353,10 +355,10 @@ def _at_origin(h):
 
 
 @kernel(error_model="numpy")
-def _landing_std(h, other) -> float:
+def _landing_std(h, other, is_vehicle) -> float:
     """Mean over other's boxes of the standard deviation of where they land in ego's frame [m]."""
     total = 0.0
-    shift, turn = _unseen_motion(h)
+    shift, turn = _unseen_motion(h, is_vehicle)
     for n in range(len(other)):
         squared_arm = (other[n, X] - h.other_x) ** 2 + (other[n, Y] - h.other_y) ** 2
         unseen = 2.0 * shift + turn * (other[n, X] ** 2 + other[n, Y] ** 2)
@@ -412,6 +414,7 @@ def advance(
     expected_offset,
     offset_step,
     offset_std,
+    is_vehicle,
     claim,
     seen,
     noise,
@@ -434,6 +437,7 @@ def advance(
         expected_offset: prior of the time offset, from the time expected_offset if there are any [s].
         offset_step: how much the expected offset changed since the last frame [s].
         offset_std: standard deviation of the prior; 0 for a known offset [s].
+        is_vehicle: whether other's frame is that of a moving vehicle.
         claim: (4, 3) x, y, yaw of a claimed pose and its covariance; infinite without a claim.
         seen: frames seen before this one.
         noise: the noise model.
@@ -442,10 +446,11 @@ def advance(
         rounds: refits of each star.
 
     Returns:
-        The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the
-        standard deviation with which the best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows
-        of ego and other that it matches in this frame; its x, y and yaw at the instants of the two lists and the time
-        offset, and the (4, 4) covariance of these four.
+        The hypotheses, best first; how far the best one's evidence exceeds the best different pose's [nats]; the same
+        of the evidence of this frame alone, infinite without a different pose; the standard deviation with which the
+        best one lands other's boxes in ego's frame, on average [m]; the (K, 2) rows of ego and other that it matches
+        in this frame; its x, y and yaw at the ego's instant and the time offset, and the (4, 4) covariance of these
+        four.
     """
     steps = dt / _STEP
     memory = min(motion.memory**steps, (seen + 1.0) / (seen + 2.0))
@@ -464,7 +469,7 @@ def advance(
         sizes[len(ego) - 1, len(other) - 1] = -_IMPOSSIBLE
     for i in range(before):
         if turn_rate_variance < np.inf:
-            _correct_turn_rate(old[i], turn_rate, turn_rate_variance)
+            _correct_turn_rate(old[i], turn_rate, turn_rate_variance, is_vehicle)
         _predict(old[i], dt, motion)
         old[i].offset += offset_step
     if len(ego) > 0 and len(other) > 0:
@@ -549,12 +554,16 @@ def advance(
         if not same_pose(ranked[0], ranked[i], SAME_DISTANCE, SAME_ANGLE):
             margin = ranked[0].evidence - ranked[i].evidence
             break
+    frame_margin = np.inf
+    for j in range(total):
+        if not same_pose(ranked[0], kept[j], SAME_DISTANCE, SAME_ANGLE):
+            frame_margin = min(frame_margin, ranked[0].frame_evidence - kept[j].frame_evidence)
     matched = np.empty((ranked[0].pairs if 0 <= best_star < count else 0, 2), np.int64)
     if len(matched):
         copy_pairs(matched, rows[best_star], len(matched))
     if len(ranked) == 0:
-        return ranked, margin, np.inf, matched, 0.0, 0.0, 0.0, 0.0, np.zeros((4, 4))
+        return ranked, margin, frame_margin, np.inf, matched, 0.0, 0.0, 0.0, 0.0, np.zeros((4, 4))
     best_hypothesis = ranked[0]
-    landing = _landing_std(best_hypothesis, other)
-    x, y, yaw, covariance = _at_origin(best_hypothesis)
-    return ranked, margin, landing, matched, x, y, yaw, best_hypothesis.offset, covariance
+    landing = _landing_std(best_hypothesis, other, is_vehicle)
+    x, y, yaw, covariance = _at_origin(best_hypothesis, is_vehicle)
+    return ranked, margin, frame_margin, landing, matched, x, y, yaw, best_hypothesis.offset, covariance

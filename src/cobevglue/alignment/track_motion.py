@@ -30,6 +30,7 @@ TRACK = np.dtype(
         ("mixed_variance", "f8"),
         ("velocity_variance", "f8"),
         ("age", "f8"),  # time since the last detection [s]
+        ("detections", "i8"),
     ],
     align=True,
 )
@@ -40,6 +41,8 @@ _MOST_AGE = 0.5
 """A track without detections ends after this time [s]."""
 _TURN_TIME = 3.0
 """Time after which the turn rate of a vehicle is another one [s]."""
+_FEWEST_DETECTIONS = 3
+"""Detections that it takes to tell a velocity: of two, one is often another object."""
 _OTHER_OBJECT = 25.0
 """Squared innovation, in variances, above which a track id is another object now."""
 _FEWEST_ANCHORS = 3
@@ -162,7 +165,7 @@ def _begin(track, identity, x, y, noise) -> None:
     """A track of one detection, at rest as far as is known."""
     track.id, track.x, track.y, track.vx, track.vy = identity, x, y, 0.0, 0.0
     track.position_variance, track.mixed_variance = noise.position**2, 0.0
-    track.velocity_variance, track.age = noise.speed**2, 0.0
+    track.velocity_variance, track.age, track.detections = noise.speed**2, 0.0, 1
 
 
 @kernel(error_model="numpy")
@@ -254,7 +257,10 @@ def follow_tracks(old, twist, twist_variance, boxes, ids, dt, noise):
                 track.mixed_variance *= 1.0 - gain
                 track.position_variance *= 1.0 - gain
                 track.age = 0.0
+                track.detections += 1
             motion_of[n, 0], motion_of[n, 1], motion_of[n, 2] = track.vx, track.vy, track.velocity_variance
+            if track.detections < _FEWEST_DETECTIONS:
+                motion_of[n, 2] = noise.speed**2
         if track.age <= _MOST_AGE:
             kept[total] = track
             total += 1

@@ -16,6 +16,8 @@ __all__ = ["Verdict", "judge", "landing_risk"]
 
 _UNMODELLED = 0.001
 """Least risk: what no model here knows of, such as objects with false positions in both lists."""
+_JUMP = 6.0
+"""Evidence against a jump of the frame between two lists: a lost list, a jerk, a wrong heading of the frame [nats]."""
 _LARGEST_EXPONENT = 500.0
 
 
@@ -33,13 +35,20 @@ class Verdict:
 
 
 def judge(
-    evidence: float, margin: float, landing_std: float, pairs: int, frames: int, config: BEVGlueConfig
+    evidence: float,
+    margin: float,
+    frame_margin: float,
+    landing_std: float,
+    pairs: int,
+    frames: int,
+    config: BEVGlueConfig,
 ) -> Verdict:
     """The verdict on the best hypothesis.
 
     Args:
         evidence: of the hypothesis [nats].
         margin: by how much that exceeds the evidence of the best different one [nats].
+        frame_margin: the same of the evidence of this frame alone.
         landing_std: standard deviation of where the other's boxes land in the ego frame [m].
         pairs: that it matches in this frame.
         frames: that were seen so far, this one included.
@@ -52,11 +61,16 @@ def judge(
     # what looks alike: then the margin only tells which parts. One frame cannot know; frames in which things move can.
     alike = config.self_similarity * (1.0 + 1.0 / frames) * max(evidence - margin, 0.0)
     second = _likelihood(alike - margin)
+    # The frame may have moved otherwise than the hypothesis expects. Then another pose explains this frame far better
+    # than the one followed, and better than a pose of nothing in common does by chance.
+    jumped = _likelihood(-frame_margin - config.chance_evidence - _JUMP)
     imprecise = landing_risk(landing_std, config.tolerance)
-    risk = _UNMODELLED + (1.0 - _UNMODELLED) * (1.0 - (1.0 - imprecise) / (1.0 + chance + second))
+    risk = _UNMODELLED + (1.0 - _UNMODELLED) * (1.0 - (1.0 - imprecise) / (1.0 + chance + second + jumped))
     if risk < config.risk:
         return Verdict(risk, "")
-    if imprecise >= max(chance, second):
+    if jumped >= max(chance, second, imprecise):
+        cause = f"a jump: a different pose fits this frame alone better by {-frame_margin:.1f} nats"
+    elif imprecise >= max(chance, second):
         cause = f"too uncertain: boxes would land within {landing_std:.1f} m"
     elif chance >= second:
         cause = f"too few common objects: evidence {evidence:.1f} nats"

@@ -41,6 +41,14 @@ def replay(
             help="Length and width of an agent's own vehicle, and where its middle is in the frame of its lists [m].",
         ),
     ] = None,
+    frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AGENT=FRAME",
+            help="Frame into which recorded transforms (tf) bring an agent's lists; default: base_link for those in a "
+            "map, the others are left as they are.",
+        ),
+    ] = None,
     max_age: Annotated[
         float, typer.Option(metavar="SECONDS", help="Lists received so much earlier than the ego's are not used.")
     ] = 0.5,
@@ -72,8 +80,10 @@ def replay(
     with expected_errors(), _missing_modules(), open_recording(recording) as opened:
         made = Replay(opened, ego, other or (), max_age=max_age)
         made.bodies = _bodies(body or [], made)
+        made.frames = dict(_of_agent("--frame", text, made) for text in frame or [])
         for agent, topic in made.topics.items():
             print_note(f"{'ego' if agent == made.ego else 'other'}: {agent} ({topic.name}, {topic.count} messages)")
+        print_note("aligning (the first run compiles for half a minute) …")
         summary, files = run_replay(made, out, rerun=rerun, progress=_note)
     for stream in made.streams.values():
         for problem in stream.problems():
@@ -94,18 +104,25 @@ def _note(done: int, total: int) -> None:
 def _bodies(given: list[str], made: Replay) -> dict[str, Boxes]:
     """Own vehicles from texts such as car1=4.5,1.9."""
     from cobevglue.cli.body_option import parse_body
-    from cobevglue.datasets.frame import did_you_mean
 
     bodies = {}
     for text in given:
-        agent, _, numbers = text.partition("=")
-        if agent not in made.topics:
-            raise InputError(f"--body: there is no agent {did_you_mean(agent, made.topics)}")
+        agent, numbers = _of_agent("--body", text, made)
         try:
             bodies[agent] = parse_body(numbers)
         except ValueError:
             raise InputError(f"--body: must be AGENT=LENGTH,WIDTH or AGENT=LENGTH,WIDTH,X,Y, got {text!r}") from None
     return bodies
+
+
+def _of_agent(option: str, text: str, made: Replay) -> tuple[str, str]:
+    """Agent and value of an option AGENT=VALUE."""
+    from cobevglue.datasets.frame import did_you_mean
+
+    agent, _, value = text.partition("=")
+    if agent not in made.topics:
+        raise InputError(f"{option}: there is no agent {did_you_mean(agent, made.topics)}")
+    return agent, value
 
 
 def _print(summary: Summary, files: list[Path]) -> None:

@@ -74,15 +74,23 @@ def simulate(
     numbers of points. --format v2v4real has two vehicles, dair-v2x one vehicle and a roadside unit. The same options
     give the same files, and the same command resumes an interrupted run.
 
-    --format mcap writes a ROS 2 bag with object lists of --agents vehicles at a junction, for `cobevglue replay`:
-    detections with errors, without clouds, of different instants. Only --frames and --seed apply to it.
+    --format mcap writes a ROS 2 bag with object lists of vehicles at a junction, for `cobevglue replay`:
+    detections with errors, without clouds, of different instants. Only --frames, --agents and --seed apply to it.
 
     Needs: pip install 'cobevglue[simulation]', and 'cobevglue[ros]' for mcap
     """
     if kind is Format.MCAP:
-        for option, given in (("--split", split), ("--network", network), ("--roadside-units", roadside_units)):
-            if given is not None:
-                raise InputError(f"{option}: not for --format mcap")
+        _refuse_given(
+            {
+                "--split": split is not None,
+                "--network": network is not None,
+                "--roadside-units": roadside_units is not None,
+                "--scenarios": scenarios != 1,
+                "--lidar": lidar is not LidarName.OPV2V,
+                "--labels-only": labels_only,
+                "--workers": workers is not None,
+            }
+        )
         _write_bag(out, frames, agents or 2, seed, as_json)
         return
     _require_extra()
@@ -122,6 +130,13 @@ def simulate(
             f"{out}: {scenarios} x {frames} frames of {settings.agents + settings.roadside_units} agents, "
             f"{report.frames_written} written, {report.frames_kept} existed already"
         )
+
+
+def _refuse_given(options: dict[str, bool]) -> None:
+    """An error for options that were given although they say nothing about object lists."""
+    for option, given in options.items():
+        if given:
+            raise InputError(f"{option}: not for --format mcap")
 
 
 def _write_bag(out: Path, frames: int, agents: int, seed: int, as_json: bool) -> None:

@@ -121,6 +121,24 @@ class Frame:
             union = Boxes.concatenate(parts)
         return union if include_ego else union[~covers_origin(union)]
 
+    def own_vehicle(self, agent: str) -> Boxes | None:
+        """The vehicle that carries an agent's LiDAR, as labelled by another agent.
+
+        Args:
+            agent: name of an agent.
+
+        Returns:
+            One box without `track_id` in the agent's LiDAR frame; None for a roadside unit, and where nobody labels it.
+
+        Raises:
+            ValueError: unknown agent, or a malformed file.
+        """
+        if agent in self.agents and self.agents[agent].is_infrastructure:
+            return None
+        objects = self.ground_truth(agent, include_ego=True)
+        own = objects[covers_origin(objects)]
+        return own.replace(track_id=None, score=None) if len(own) == 1 else None
+
 
 class Scenario(Sequence[Frame]):
     """The frames of one recording in temporal order; indexing creates a new `Frame` without reading its files."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import zlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from cobevglue.boxes import Boxes
 from cobevglue.settings import Settings
 from cobevglue.typing import FloatArray
 
@@ -28,12 +29,14 @@ class ObservedFrame:
         observations: the output of each agent's perception.
         claimed: (4, 4) world_SE3_lidar from each agent's localisation.
         true: (4, 4) world_SE3_lidar of each agent at the time of its observation; for the evaluation only.
+        own_vehicles: one-row box of the vehicle of each agent that has one, in its LiDAR frame.
     """
 
     time: float
     observations: Mapping[str, PerceptionOutput]
     claimed: Mapping[str, FloatArray]
     true: Mapping[str, FloatArray]
+    own_vehicles: Mapping[str, Boxes] = field(default_factory=dict)
 
     def without(self, agent: str) -> ObservedFrame:
         """The frame without this agent."""

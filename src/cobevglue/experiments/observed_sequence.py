@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class ObservedSequence:
     truth: list[FrameTruth] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     _perception: dict[str, Perception] = field(default_factory=dict)
+    _own_vehicles: dict[str, Boxes] = field(default_factory=dict)
 
     def observe(self, frames: Iterable[Frame]) -> range:
         """Run the perception of all agents on the next frames of the sequence.
@@ -66,7 +67,7 @@ class ObservedSequence:
         for index in range(before):
             old = self.frames[index]
             if old.observations:
-                self.frames[index] = ObservedFrame(old.time, {}, old.claimed, old.true)
+                self.frames[index] = replace(old, observations={})
 
     def _observe(self, frame: Frame) -> None:
         clouds = dict(self._clouds(frame))
@@ -86,7 +87,8 @@ class ObservedSequence:
         for name, points in clouds.items():
             perception = self._perception.setdefault(name, Perception(self.detector))
             observed[name] = perception.step(points, frame.time)
-        self.frames.append(ObservedFrame(frame.time, observed, poses, poses))
+        self._own_vehicles.update({name: own for name in agents if (own := frame.own_vehicle(name)) is not None})
+        self.frames.append(ObservedFrame(frame.time, observed, poses, poses, dict(self._own_vehicles)))
         self.truth.append(_truth(frame.timestamp, objects, self.ego, agents, observed))
 
     def _clouds(self, frame: Frame) -> Iterator[tuple[str, Float32Array]]:

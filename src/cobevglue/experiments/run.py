@@ -107,7 +107,7 @@ class _Run:
             self._system.aligner.reset()
         poses = frame.true if self.condition.true_poses else frame.claimed
         self._memo.saved = 0.0
-        out = self._system.collaborate(frame.observations, observed.ego, frame.time, poses)
+        out = self._system.collaborate(frame.observations, observed.ego, frame.time, poses, bodies=frame.own_vehicles)
         out.seconds["messages"] += self._memo.saved
         received = tuple(_received_poses(frame, observed.ego, out))
         self.frames[index] = FrameResult(_without_labels(out.boxes), received, out.seconds)
@@ -116,10 +116,11 @@ class _Run:
 def _received_poses(frame: ObservedFrame, ego: str, out: StepOutput) -> Iterator[ReceivedPose]:
     for agent, alignment in out.alignments.items():
         translation = yaw = landing = math.inf
-        if alignment.ego_SE2_other is not None:
+        pose = alignment.ego_SE2_list or alignment.ego_SE2_other
+        if pose is not None:
             truth = SE2.from_matrix(np.linalg.inv(frame.true[ego]) @ frame.true[agent])
-            translation, yaw = alignment.ego_SE2_other.error_to(truth)
-            landing = landing_error(alignment.ego_SE2_other, truth, frame.observations[agent].boxes)
+            translation, yaw = pose.error_to(truth)
+            landing = landing_error(pose, truth, frame.observations[agent].boxes)
         yield ReceivedPose(
             agent, translation, yaw, landing, alignment.reason, out.message_bytes[agent], out.alignment_bytes[agent]
         )

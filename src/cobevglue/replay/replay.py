@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 from cobevglue.boxes import Boxes
 from cobevglue.object_collaboration import FusedObjects, ObjectCollaboration
 from cobevglue.recordings import Recording
-from cobevglue.replay.sources import Source, make_source
+from cobevglue.replay.sources import Source, is_elsewhere, make_source
 from cobevglue.replay.stream import AgentStream, Arrival
-from cobevglue.replay.topics import CLOUDS, agent_topics
+from cobevglue.replay.topics import CLOUDS, OBJECTS, agent_topics
+from cobevglue.replay.transforms import Transforms, transform_topics
 
 if TYPE_CHECKING:
     from cobevglue.perception import PointPillars
@@ -54,7 +55,7 @@ class _List:
 
 
 class Replay:
-    """The frames of a recording, in order; iterate once.
+    """The frames of a recording, in order.
 
     Args:
         recording: an open one.
@@ -62,6 +63,8 @@ class Replay:
         others: topics of the other agents; guessed if left out.
         max_age: lists that were received earlier before the ego's are not used [s].
         bodies: one-row box of the own vehicle of agents that know it, by agent, in their own frame.
+        frames: by agent, the frame into which its object lists are brought by the recorded transforms. By default they
+            are left where they are; those in a map are brought into `base_link`.
         detector: for topics with point clouds; the shipped one by default.
 
     Attributes:
@@ -82,6 +85,7 @@ class Replay:
         *,
         max_age: float = 0.5,
         bodies: dict[str, Boxes] | None = None,
+        frames: dict[str, str] | None = None,
         detector: PointPillars | None = None,
     ) -> None:
         if not max_age > 0.0:
@@ -91,11 +95,9 @@ class Replay:
         self.ego = next(iter(self.topics))
         if detector is None and any(topic.type in CLOUDS for topic in self.topics.values()):
             detector = _shipped_detector()
-        self._sources: dict[str, Source] = {
-            topic.name: make_source(agent, topic, detector) for agent, topic in self.topics.items()
-        }
+        self.frames = frames or {}
+        self._detector = detector
         self.streams: dict[str, AgentStream] = {}
-        self._collaboration = ObjectCollaboration()
 
     def __iter__(self) -> Iterator[ReplayFrame]:
         """Read the recording.
@@ -103,25 +105,27 @@ class Replay:
         Raises:
             ValueError: the recording is damaged, or a message has a bad value; names topic and message.
         """
+        collaboration = ObjectCollaboration()
         newest: dict[str, _List] = {}
+        self.streams.clear()
         index = 0
         for agent, entry, is_restart in self._lists():
             if is_restart and agent == self.ego:
-                self._collaboration.reset()
+                collaboration.reset()
                 newest.clear()
             elif is_restart:
-                self._collaboration.forget(agent)
+                collaboration.forget(agent)
             newest[agent] = entry
             if agent == self.ego:
-                yield self._frame(index, newest)
+                yield self._frame(index, newest, collaboration)
                 index += 1
 
-    def _frame(self, index: int, newest: dict[str, _List]) -> ReplayFrame:
+    def _frame(self, index: int, newest: dict[str, _List], collaboration: ObjectCollaboration) -> ReplayFrame:
         own = newest[self.ego]
         used = {agent: entry for agent, entry in newest.items() if own.received - entry.received <= self.max_age}
         stamps = {agent: entry.stamp for agent, entry in used.items()}
         bodies = {agent: entry.body for agent, entry in used.items() if entry.body is not None}
-        seen = self._collaboration.step(
+        seen = collaboration.step(
             {agent: entry.boxes for agent, entry in used.items()},
             self.ego,
             own.stamp,
@@ -133,10 +137,15 @@ class Replay:
 
     def _lists(self) -> Iterator[tuple[str, _List, bool]]:
         """Agent, list, and whether everything before it is to be forgotten, in the order of receipt."""
-        counts = dict.fromkeys(self._sources, 0)
-        for topic, received, message in self.recording.messages(self._sources):
+        sources, trees = self._make_sources()
+        counts = dict.fromkeys(sources, 0)
+        for topic, received, message in self.recording.messages([*sources, *trees]):
+            if topic in trees:
+                for tree in trees[topic]:
+                    tree.add(message)
+                continue
             counts[topic] += 1
-            source = self._sources[topic]
+            source = sources[topic]
             try:
                 agent, stamp = source.sender(message)
                 stream = self._stream(agent, topic)
@@ -155,6 +164,27 @@ class Replay:
             restart = arrival is Arrival.RESTART or content.new_identities
             yield agent, _List(stamp, received, content.boxes, content.body), restart
 
+    def _make_sources(self) -> tuple[dict[str, Source], dict[str, list[Transforms]]]:
+        """The sources by topic; by topic with transforms, the trees that need them."""
+        sources: dict[str, Source] = {}
+        trees: dict[str, list[Transforms]] = {}
+        types = {name: topic.type for name, topic in self.recording.topics.items()}
+        for agent, topic in self.topics.items():
+            own_frame, tree = self.frames.get(agent), None
+            if topic.type in OBJECTS and self._is_elsewhere(topic.name, own_frame):
+                of_agent = transform_topics(topic.name, types)
+                if of_agent:
+                    tree = Transforms()
+                    for name in of_agent:
+                        trees.setdefault(name, []).append(tree)
+            sources[topic.name] = make_source(agent, topic, self._detector, own_frame, tree)
+        return sources, trees
+
+    def _is_elsewhere(self, topic: str, own_frame: str | None) -> bool:
+        """Whether the first list of a topic has to be brought into the agent's own frame."""
+        first = next(self.recording.messages([topic]), None)
+        return first is not None and is_elsewhere(str(first[2].header.frame_id), own_frame)
+
     def _stream(self, agent: str, topic: str) -> AgentStream:
         stream = self.streams.setdefault(agent, AgentStream(topic))
         if stream.topic != topic:
@@ -166,7 +196,5 @@ def _shipped_detector() -> PointPillars:
     try:
         from cobevglue.perception import PointPillars
     except ImportError as error:
-        raise ModuleNotFoundError(
-            f"point clouds need the detector: pip install 'cobevglue[perception]' ({error})", name="torch"
-        ) from None
+        raise ModuleNotFoundError(f"point clouds: {error}", name="torch") from None
     return PointPillars.pretrained("compact")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
+from cobevglue.datasets.whole_files import errors_name
 from cobevglue.replay.replay import Replay, ReplayFrame
 from cobevglue.replay.summary import Summary, frame_line
 
@@ -41,7 +42,9 @@ def run_replay(
         OSError: a file cannot be written.
         ModuleNotFoundError: a module that writes a file is not installed.
     """
-    with _named_folder(out):
+    if out is None:
+        return _run(replay, None, rerun, progress)
+    with errors_name(out):
         return _run(replay, out, rerun, progress)
 
 
@@ -69,17 +72,6 @@ def _run(
 
     files = write_replay_report(replay, summary, list(shown.values()), out)
     return summary, [*files, out / MCAP, out / LINES, *([out / RERUN] if rerun else [])]
-
-
-@contextmanager
-def _named_folder(out: Path | None) -> Iterator[None]:
-    """Errors of writing that name no file, such as that of a full disk, name the folder."""
-    try:
-        yield
-    except OSError as error:
-        if out is None or error.filename is not None or error.errno is None:
-            raise
-        raise OSError(error.errno, error.strerror, str(out)) from error
 
 
 def _writers(out: Path, ego: str, rerun: bool, stack: ExitStack) -> list[Callable[[ReplayFrame], None]]:

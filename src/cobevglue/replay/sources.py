@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cobevglue.boxes import Boxes
+from cobevglue.datasets.poses import transform_boxes
 from cobevglue.interop.ros import boxes_from_ros, points_from_ros, stamp_from_ros
 from cobevglue.messages import MessageError, ObjectMessage, decode
 from cobevglue.recordings import Topic
 from cobevglue.replay.topics import CLOUDS, MESSAGES
+from cobevglue.replay.transforms import Transforms
 
 if TYPE_CHECKING:
     from cobevglue.perception import Perception, PointPillars
 
-__all__ = ["Content", "Source", "make_source"]
+__all__ = ["Content", "Source", "is_elsewhere", "make_source"]
 
 _FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm"})
+_VEHICLE = "base_link"
+"""Frame of a vehicle, by the convention of ROS (REP-105)."""
 _FARTHEST, _LARGEST = 10_000.0, 1_000.0
 """Of the objects that an agent can see: distance and size [m]; beyond, they are not in its frame, or damaged."""
 _CPM_PORT = (2009).to_bytes(2, "big")
@@ -66,22 +70,30 @@ class Source(ABC):
 class _Objects(Source):
     """Object lists; their identities are used as long as all objects have one."""
 
-    def __init__(self, agent: str) -> None:
+    def __init__(self, agent: str, own_frame: str | None, transforms: Transforms | None) -> None:
         super().__init__(agent)
+        self._own_frame, self._transforms = own_frame, transforms
         self._numbers: dict[str, int] | None = {}
 
     def sender(self, message: Any) -> tuple[str, float]:
-        _check_frame(message)
         return self.agent, stamp_from_ros(message)
 
     def content(self, message: Any, time: float) -> Content:
         found = boxes_from_ros(message, self._numbers)
-        _check_boxes(found.boxes)
+        boxes = self._in_own_frame(found.boxes, str(message.header.frame_id), time)
+        _check_boxes(boxes)
         drops = self._numbers is not None and len(found.boxes) > 0 and found.boxes.track_id is None
         were_used = bool(self._numbers)
         if drops:
             self._numbers = None
-        return Content(found.boxes, without_size=found.without_size, new_identities=drops and were_used)
+        return Content(boxes, without_size=found.without_size, new_identities=drops and were_used)
+
+    def _in_own_frame(self, boxes: Boxes, frame: str, time: float) -> Boxes:
+        if not is_elsewhere(frame, self._own_frame):
+            return boxes
+        if self._transforms is None:
+            raise ValueError(_fixed(frame))
+        return transform_boxes(boxes, self._transforms.between(self._own_frame or _VEHICLE, frame, time))
 
 
 class _Clouds(Source):
@@ -93,7 +105,9 @@ class _Clouds(Source):
         self._last = float("-inf")
 
     def sender(self, message: Any) -> tuple[str, float]:
-        _check_frame(message)
+        frame = str(message.header.frame_id)
+        if is_elsewhere(frame, None):
+            raise ValueError(_fixed(frame))
         return self.agent, stamp_from_ros(message)
 
     def content(self, message: Any, time: float) -> Content:
@@ -118,18 +132,33 @@ class _Messages(Source):
         return Content(decoded.boxes, decoded.body)
 
 
-def make_source(agent: str, topic: Topic, detector: PointPillars | None) -> Source:
+def make_source(
+    agent: str,
+    topic: Topic,
+    detector: PointPillars | None = None,
+    own_frame: str | None = None,
+    transforms: Transforms | None = None,
+) -> Source:
     """The source for a topic.
 
     Args:
         agent: whose topic it is.
         topic: of a type in `cobevglue.replay.topics`.
         detector: for point clouds.
+        own_frame: frame into which object lists are brought; None to leave them where they are unless they are in a
+            map, and to bring those into `base_link`.
+        transforms: for it; filled while the recording is read.
     """
     if topic.type in CLOUDS:
         assert detector is not None
         return _Clouds(agent, detector)
-    return _Messages(agent) if topic.type in MESSAGES else _Objects(agent)
+    return _Messages(agent) if topic.type in MESSAGES else _Objects(agent, own_frame, transforms)
+
+
+def is_elsewhere(frame: str, own_frame: str | None) -> bool:
+    """Whether a list in this frame has to be brought into the agent's own: that of a map, or not the one wanted."""
+    name = frame.strip("/")
+    return name.rsplit("/", 1)[-1] in _FIXED_FRAMES or (own_frame is not None and name != own_frame.strip("/"))
 
 
 def _decoded(data: bytes) -> ObjectMessage:
@@ -155,12 +184,11 @@ def _check_boxes(boxes: Boxes) -> None:
             raise ValueError(f"{name}: row {row} has {values[row]:.4g} m, at most {limit:g} m are possible{hint}")
 
 
-def _check_frame(message: Any) -> None:
-    frame = str(message.header.frame_id).strip("/")
-    if frame.rsplit("/", 1)[-1] in _FIXED_FRAMES:
-        raise ValueError(
-            f"frame_id: this is in the fixed frame {frame!r}; it must be in the agent's own frame, such as base_link"
-        )
+def _fixed(frame: str) -> str:
+    return (
+        f"frame_id: this is in the frame {frame!r}, and there are no transforms (tf) into the agent's own, such as "
+        "base_link"
+    )
 
 
 def _perception(detector: PointPillars) -> Perception:

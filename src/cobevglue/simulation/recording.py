@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cobevglue.datasets.whole_files import errors_name
 from cobevglue.recordings.writer import new_detection_bag
 from cobevglue.simulation.object_lists import Junction, JunctionSettings, observe
 
@@ -44,7 +45,7 @@ def write_recording(folder: str | Path, seed: int, frames: int, agents: int) -> 
     settings = JunctionSettings(agents=agents, duration=frames / 10.0)
     traffic = Junction(seed, settings).traffic
     counts = {f"/car{agent + 1}/objects": 0 for agent in range(agents)}
-    with new_detection_bag(folder) as bag:
+    with errors_name(Path(folder)), new_detection_bag(folder) as bag:
         for index in range(frames):
             for agent, topic in enumerate(counts):
                 time = index / settings.rate + STAGGER * agent

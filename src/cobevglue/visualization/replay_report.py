@@ -15,6 +15,7 @@ from cobevglue.boxes import Boxes
 from cobevglue.iou import bev_iou
 from cobevglue.replay.replay import Replay, ReplayFrame
 from cobevglue.replay.summary import Summary
+from cobevglue.visualization.alignment import draw_alignment
 from cobevglue.visualization.bev import draw_agent, draw_boxes
 from cobevglue.visualization.report_page import Part, figure, paragraphs, table, write_page
 from cobevglue.visualization.style import (
@@ -36,6 +37,8 @@ from cobevglue.visualization.style import (
 __all__ = ["agent_table", "draw_frame", "draw_timeline", "write_replay_report"]
 
 PAGE, TIMELINE, FRAME = "index.html", "timeline.png", "frame.png"
+_MATCHED_AGENTS = 4
+"""Other agents whose matches are drawn, at most."""
 _AGENT_COLORS = (OTHER, "#AA4499", "#E69F00", "#56B4E9", "#882255", "#999933", "#332288")
 
 
@@ -130,6 +133,11 @@ def write_replay_report(replay: Replay, summary: Summary, shown: Sequence[Replay
     """
     pictures = [draw_frame(frame, replay.ego) for frame in shown]
     best = max(range(len(shown)), key=lambda k: len(shown[k].seen.objects))
+    most = shown[best].seen
+    matched = [
+        draw_alignment(most.lists[replay.ego], most.lists[name], alignment, ego_name=replay.ego, other_name=name)
+        for name, alignment in list(most.alignments.items())[:_MATCHED_AGENTS]
+    ]
     files = [save_figure(draw_timeline(summary), folder / TIMELINE), save_figure(pictures[best], folder / FRAME)]
     header, rows = agent_table(summary)
     problems = [problem for stream in replay.streams.values() for problem in stream.problems()]
@@ -149,6 +157,14 @@ def write_replay_report(replay: Replay, summary: Summary, shown: Sequence[Replay
                 figure(figure_png(picture), f"Frame {frame.index}, {frame.time - start:.1f} s after the first picture.")
                 for picture, frame in zip(pictures, shown, strict=True)
             ),
+        ),
+        Part(
+            "How they are found",
+            paragraphs(
+                "The pose of another agent is the motion that brings its objects onto those of the ego. Matched "
+                "objects have the same number; green are the distances that both lists have in common."
+            )
+            + "".join(figure(figure_png(picture), f"Frame {shown[best].index}.") for picture in matched),
         ),
         Part("The recording", table(*_stream_table(replay), notes=problems)),
     ]
@@ -178,6 +194,6 @@ def _stream_table(replay: Replay) -> tuple[list[str], list[list[str]]]:
     header = ["agent", "topic", "lists", "rate", "longest gap"]
     rows = [
         [agent, stream.topic, str(stream.lists), f"{stream.rate:.1f} Hz", f"{stream.longest_gap:.2f} s"]
-        for agent, stream in replay.streams.items()
+        for agent, stream in sorted(replay.streams.items(), key=lambda each: each[0] != replay.ego)
     ]
     return header, rows
