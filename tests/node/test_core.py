@@ -77,6 +77,22 @@ def test_lost_doubled_and_reordered_messages() -> None:
     assert drive.ego.metrics.value("lost_messages", agent="car2") == 8
 
 
+def test_group_of_three_with_lost_messages() -> None:
+    core = NodeCore("car1", 1, NodeSettings(aligner="bevglue-group"))
+    others = {name: NodeCore(name, 10) for name in ("car2", "car3")}
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        now = 0.1 * k
+        for name, other in others.items():
+            sent = other.observe(own_list(frames(3)[k], name, now), now)
+            if rng.random() > 0.3:
+                core.receive(sent.data, now, sent.header)
+        core.observe(own_list(frames(3)[k], "car1", now), now)
+        result = core.align(now)
+    assert result is not None
+    assert all(found.accepted for found in result.alignments.values())
+
+
 def test_damaged_messages_are_refused() -> None:
     drive = Drive()
     rng = np.random.default_rng(0)
