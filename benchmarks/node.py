@@ -354,7 +354,8 @@ def pairs_accepted(documents: list[dict[str, Any]], name: str) -> set[tuple[str,
 def set_realtime(pid: int) -> None:
     """Real-time priority for all threads of a process."""
     for thread in Path(f"/proc/{pid}/task").iterdir():
-        os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
+        with contextlib.suppress(ProcessLookupError):  # it ended just now
+            os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
 
 
 def free_ports(number: int) -> list[int]:
