@@ -17,13 +17,14 @@ the damage gets past it. Then:
   was changed is refused.
 - A node goes through it all: it receives what decodes, and aligns.
 
-Exit code: 0 no failure, 1 failures, whose bytes are printed.
+Ctrl-C ends the format that is being tested, with a report so far. Exit code: 0 no failure, 1 failures, whose bytes are printed.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import signal
 import struct
 import sys
 import time
@@ -119,7 +120,9 @@ def fuzz(name: str, seed: int, messages: int, seconds: float = math.inf) -> Repo
     known = frozenset(originals)
     report, node = Report(), Node()
     batch, end = 0, time.monotonic() + seconds
-    while report.messages < messages and time.monotonic() < end:
+    interrupted: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupted.append(number))
+    while report.messages < messages and time.monotonic() < end and not interrupted:
         rng = np.random.default_rng([seed, stream, batch])
         batch += 1
         for _ in range(100):
@@ -140,6 +143,7 @@ def fuzz(name: str, seed: int, messages: int, seconds: float = math.inf) -> Repo
         if report.slowest > SLOW:
             report.fail(f"slow: {report.slowest:.1f} s", data)
             break
+    signal.signal(signal.SIGINT, before)
     return report
 
 

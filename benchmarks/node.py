@@ -10,7 +10,7 @@ The agents are those of a simulated junction, whose eight seconds are driven for
 nothing jumps. Over zenoh each agent is a process of its own, `cobevglue node`, fed through standard input; every 15 s
 one of them is killed (SIGKILL) and started again. Messages are handled when they are ready for alignment or refused.
 In the time-lapse one `NodeCore` receives the messages of seven senders, of which some are lost, doubled, late, or
-damaged, and the senders restart now and then.
+damaged, and the senders restart now and then. Ctrl-C ends it early, with the results so far.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ import urllib.request
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import cycle
+from itertools import combinations, cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cobevglue.alignment import Alignment
+from cobevglue.alignment import Alignment, BEVGlue
 from cobevglue.messages import ObjectMessage, encode
 from cobevglue.node import NodeCore, OwnList, SessionHeader, encode_header, warm_up, write_list
 from cobevglue.se2 import SE2, wrap_angle
 from cobevglue.simulation import Junction, JunctionSettings, ObjectListFrame
 from cobevglue.tracking import Sort
+from cobevglue.typing import BoolArray
 from common import print_head
 
 RATE = 10.0
@@ -199,7 +200,8 @@ def soak(seconds: float, seed: int, kill_every: float, realtime: bool) -> dict[s
             agent.prioritise()
     listener = Listener(endpoints)
     stop = threading.Event()
-    feeder = threading.Thread(target=feed, args=(agents, seed, stop))
+    begin = time.time()
+    feeder = threading.Thread(target=feed, args=(agents, seed, begin, stop))
     feeder.start()
     if realtime:
         set_realtime(os.getpid())
@@ -252,7 +254,7 @@ def soak(seconds: float, seed: int, kill_every: float, realtime: bool) -> dict[s
         "refused at the end": dict(refused),
         **memory_growth(agents),
         **accepted(listener.results),
-        **times_to_alignment(listener.results, restarts),
+        **times_to_alignment(listener.results, restarts, undisturbed(seed), begin),
         "exit codes after SIGTERM": str(exit_codes),
         "real-time priority; load average": f"{'yes' if realtime else 'no'}; {os.getloadavg()[0]:.1f}",
     }
@@ -260,14 +262,14 @@ def soak(seconds: float, seed: int, kill_every: float, realtime: bool) -> dict[s
     return results
 
 
-def feed(agents: list[AgentProcess], seed: int, stop: threading.Event) -> None:
+def feed(agents: list[AgentProcess], seed: int, start: float, stop: threading.Event) -> None:
     """Give every agent its lists at the rate, each at its own phase."""
     frames = back_and_forth(seed)
     lines = [
         [write_list(OwnList(frame.agents[name].boxes, 0.5, frame.agents[name].body)) for name in AGENTS]
         for frame in frames
     ]
-    start, tick = time.time(), 0
+    tick = 0
     while not stop.is_set():
         due = start + tick / (RATE * len(agents))
         time.sleep(max(0.0, due - time.time()))
@@ -309,11 +311,30 @@ def accepted(results: list[tuple[float, dict[str, Any]]]) -> dict[str, str]:
     return {"alignments": f"{len(verdicts):,}", "accepted": share(sum(verdicts), len(verdicts))}
 
 
+def undisturbed(seed: int) -> dict[frozenset[str], BoolArray]:
+    """Of each pair, in which frames an aligner accepts that was never interrupted: some see too little in common."""
+    frames = back_and_forth(seed)
+    trackers = {name: Sort() for name in AGENTS}
+    aligners = {pair: BEVGlue() for pair in combinations(AGENTS, 2)}
+    found: dict[frozenset[str], list[bool]] = {frozenset(pair): [] for pair in aligners}
+    for step in range(2 * len(frames)):
+        frame, now = frames[step % len(frames)], step / RATE
+        lists = {name: trackers[name].update(frame.agents[name].boxes, now) for name in AGENTS}
+        for (ego, other), aligner in aligners.items():
+            own, theirs = frame.agents[ego].body, frame.agents[other].body
+            alignment = aligner.align(lists[ego], lists[other], now, ego_body=own, other_body=theirs)
+            found[frozenset((ego, other))].append(alignment.accepted)
+    return {pair: np.array(accepted[len(frames) :]) for pair, accepted in found.items()}
+
+
 def times_to_alignment(
-    results: list[tuple[float, dict[str, Any]]], restarts: list[tuple[str, float]]
+    results: list[tuple[float, dict[str, Any]]],
+    restarts: list[tuple[str, float]],
+    control: dict[frozenset[str], BoolArray],
+    begin: float,
 ) -> dict[str, Any]:
     """From the first result of a restarted agent to the first accepted alignment, of each pair and direction."""
-    times = []
+    times, possible = [], []
     again = 0
     for name, killed in restarts:
         before = pairs_accepted([doc for t, doc in results if killed - 1.0 <= t < killed], name)
@@ -327,7 +348,11 @@ def times_to_alignment(
             if first <= t <= first + LOOK_FOR:
                 for pair in pairs_accepted([document], name):
                     found.setdefault(pair, t - first)
-        times += [found.get(pair, math.inf) for pair in sorted(before)]
+        for pair in sorted(before):
+            accepted_there = control[frozenset(pair)]
+            phase = round(RATE * (first - begin)) + np.arange(round(2.0 * RATE))
+            times.append(found.get(pair, math.inf))
+            possible.append(bool(accepted_there[phase % len(accepted_there)].any()))
     if not times:
         return {"kills": len(restarts)}
     median, most = np.median(times), np.quantile(times, 0.95, method="lower")
@@ -338,6 +363,9 @@ def times_to_alignment(
         "aligned again, 95 % within": f"{most:.2f} s",
         "aligned again, the slowest": f"{max(times):.2f} s",
         "aligned again within 2 s of the first frame": share(sum(t <= 2.0 for t in times), len(times)),
+        "the same, of pairs that an uninterrupted aligner accepts in these 2 s": share(
+            sum(t <= 2.0 for t, could in zip(times, possible, strict=True) if could), sum(possible)
+        ),
     }
 
 
@@ -422,8 +450,10 @@ def time_lapse(frames: int, seed: int) -> dict[str, Any]:
     begin = time.perf_counter()
     scenes = [back_and_forth(seed + scene) for scene in range(SCENES)]
     making = time.perf_counter() - begin
+    interrupted: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: interrupted.append(number))
     begin = time.perf_counter()
-    while done < frames:
+    while done < frames and not interrupted:
         scene = scenes[done // SCENE_FRAMES % SCENES]
         senders = []
         for name in AGENTS[1:]:
@@ -450,7 +480,9 @@ def time_lapse(frames: int, seed: int) -> dict[str, Any]:
                 judge(alignment, frame.ego_SE2_other("car1", name), verdicts, errors)
             core.events.clear()
             done += 1
-            if done % max(frames // 20, 1) == 0:
+            if interrupted:
+                break
+            if done % 500 == 0:
                 memory.append(resident_memory())
                 if len(steps) > 200_000:
                     del steps[:100_000], errors[:-100_000]
@@ -470,7 +502,10 @@ def time_lapse(frames: int, seed: int) -> dict[str, Any]:
         "median error": f"{np.median(errors):.2f} m",
         "refused messages": dict(refused),
         "restarts noticed": int(core.metrics.value("restarts_total")),
-        "memory at 5 %, 50 %, 100 %": " ".join(f"{memory[k]:.1f}" for k in (0, len(memory) // 2, -1)) + " MB",
+        "memory after 500 frames, halfway, at the end": " ".join(
+            f"{memory[k]:.1f}" for k in (0, len(memory) // 2, -1) if memory
+        )
+        + " MB",
     }
     show("Time-lapse", results)
     return results
