@@ -17,7 +17,8 @@ the damage gets past it. Then:
   was changed is refused.
 - A node goes through it all: it receives what decodes, and aligns.
 
-Ctrl-C ends the format that is being tested, with a report so far. Exit code: 0 no failure, 1 failures, whose bytes are printed.
+Ctrl-C ends the format that is being tested, with a report so far. Exit code: 0 no failure, 1 failures, whose bytes are
+printed.
 """
 
 from __future__ import annotations
