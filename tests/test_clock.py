@@ -30,6 +30,23 @@ def test_stamps_since_1970_in_other_units_are_errors(time: float, unit: str) -> 
         BEVGlue().align(NOTHING, NOTHING, time=time)
 
 
+@pytest.mark.parametrize("step", [0.0, 1e-310, 1e-9])
+def test_steps_too_short_for_velocities_are_errors(step: float) -> None:
+    clock = Clock(0.1)
+    clock.advance(0.0)
+    with pytest.raises(ValueError, match="time must be later"):
+        clock.advance(step)
+    assert clock.advance(1e-3) == 1e-3
+
+
+def test_other_list_that_follows_at_once() -> None:
+    """It is the last one again: over so short a time there is no velocity."""
+    glue = BEVGlue()
+    boxes = Boxes(np.eye(4, 3) * 9.0 + 1.0, np.full((4, 3), 2.0), np.zeros(4), track_id=np.arange(4))
+    for k in range(4):
+        glue.align(boxes, boxes, time=0.1 * k, other_time=1e-310 * k)
+
+
 @pytest.mark.parametrize(("step", "unit"), [(100, "milliseconds"), (1e5, "microseconds"), (1e8, "nanoseconds")])
 def test_stamps_since_boot_in_other_units_warn(step: float, unit: str) -> None:
     clock = Clock(0.1)

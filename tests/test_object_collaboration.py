@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cobevglue import SE2, Alignment, Boxes
-from cobevglue.alignment import GroupAligner, Observation
+from cobevglue.alignment import GroupAligner, Observation, group_aligner
 from cobevglue.iou import bev_iou
 from cobevglue.object_collaboration import ObjectCollaboration
 from cobevglue.simulation import Junction, JunctionSettings
@@ -113,6 +113,32 @@ def test_agents_come_and_go() -> None:
         seen = collaboration.step(lists, "car1", frame.time)
         assert set(seen.alignments) == set(lists) - {"car1"}
     assert seen.alignments["car2"].accepted
+
+
+def test_forgotten_agent_may_go_back_in_time() -> None:
+    collaboration = ObjectCollaboration()
+    boxes = {"a": cars((10, 0)), "b": cars((5, 5))}
+    collaboration.step(boxes, "a", 0.0, {"b": 50.0})
+    with pytest.raises(ValueError, match="b: time must not be earlier"):
+        collaboration.step(boxes, "a", 0.1, {"b": 10.0})
+    collaboration.forget("b")
+    collaboration.forget("nobody")
+    assert ids(collaboration.step(boxes, "a", 0.2, {"b": 10.0}).lists["b"]) == [0]
+
+
+@pytest.mark.parametrize("aligner", ["bevglue", "bevglue-group"])
+def test_forgotten_agent_has_no_pose(aligner: str) -> None:
+    """After some frames a pair of frames with little in common is accepted: not so after the agent was forgotten."""
+    collaboration = ObjectCollaboration(group_aligner(aligner))
+    frames = list(Junction(seed=3, settings=JunctionSettings(agents=3, duration=3.0)))
+    for frame in frames[:-1]:
+        seen = collaboration.step({name: view.boxes for name, view in frame.agents.items()}, "car1", frame.time)
+    assert seen.alignments["car2"].accepted
+    assert seen.alignments["car3"].accepted
+    collaboration.forget("car2")
+    last = {name: view.boxes[:2] for name, view in frames[-1].agents.items()}
+    seen = collaboration.step(last, "car1", frames[-1].time)
+    assert not seen.alignments["car2"].accepted
 
 
 def test_another_ego_starts_anew() -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 
-__all__ = ["Clock"]
+__all__ = ["SHORTEST_STEP", "Clock"]
 
 _LATEST = 1e11
 """Times from here on are in no unit of seconds: since 1970, this is the year 5138 [s]."""
+SHORTEST_STEP = 1e-6
+"""Two times that differ by less are one: velocities between them would be meaningless [s]."""
 _LONG_STEP = 20.0
 """A step between frames that is implausible if it comes again and again: 20 ms in milliseconds [s]."""
 _LONG_STEPS = 3
@@ -52,7 +54,7 @@ class Clock:
             raise ValueError(f"time must be finite, got {time}")
         if abs(time) >= _LATEST:
             raise ValueError(f"time must be in seconds: {time:.6g} looks like {_unit(abs(time) / _LATEST)}")
-        if last is not None and time <= last:
+        if last is not None and time - last < SHORTEST_STEP:
             raise ValueError(f"time must be later than the last one, {last} s, got {time} s (reset() starts anew)")
         self.time = time
         if last is None:

@@ -231,3 +231,16 @@ def test_best_hypothesis_is_the_accepted_pose() -> None:
     assert first.ego_SE2_other.error_to(alignment.ego_SE2_other) == pytest.approx((0.0, 0.0), abs=1e-9)
     np.testing.assert_allclose(first.covariance, alignment.covariance, rtol=1e-6, atol=1e-9)
     assert first.log_odds > math.log(0.95 / 0.05)
+
+
+def test_list_that_comes_again_is_no_new_one() -> None:
+    """Of an agent whose message was lost, the last list is used again, with the time stamp that it has."""
+    world, poses = car_park(1)
+    group = BEVGlueGroup()
+    for step in range(6):
+        stamps = {"car0": 0.1 * step, "car1": 50.0 + 0.1 * (step // 2), "car2": 0.1 * step}
+        observations = {
+            name: Observation(seen.boxes, time=stamps[name]) for name, seen in views(world, poses[:3], step).items()
+        }
+        found = group.align_group("car0", observations, 0.1 * step)
+    assert set(found) == {"car1", "car2"}

@@ -54,6 +54,7 @@ class BEVGlueGroup(GroupAligner):
         if self.config.method != "evidence":
             raise ValueError(f"config.method must be 'evidence' for a group, got {self.config.method!r}")
         self._aligners: dict[tuple[str, str], BEVGlue] = {}
+        self._times: dict[tuple[str, str], float | None] = {}
 
     def align_group(
         self, ego: str, observations: Mapping[str, Observation], time: float | None = None
@@ -72,10 +73,13 @@ class BEVGlueGroup(GroupAligner):
             known: dict[str, Any] = known_bodies(observations[names[i]].body, observations[names[j]].body)
             if observations[names[j]].time is not None:
                 known["other_time"] = observations[names[j]].time
-            own_time = time if i == 0 else observations[names[i]].time
-            alignment = aligner.align(boxes[i], boxes[j], time if own_time is None else own_time, **known)
             if i == 0:
-                direct[j] = alignment
+                direct[j] = aligner.align(boxes[i], boxes[j], time, **known)
+            else:
+                own_time, pair = observations[names[i]].time, (names[i], names[j])
+                if own_time is None or own_time != self._times.get(pair):  # else the last list again: nothing new
+                    aligner.align(boxes[i], boxes[j], time if own_time is None else own_time, **known)
+                self._times[pair] = own_time
             pairs[i, j] = PairHypotheses.of(aligner.hypotheses, center[i], center[j])
         if len(names) > 2:
             found = _poses(best_configuration(pairs, len(names), self.config.risk), pairs)
@@ -85,10 +89,13 @@ class BEVGlueGroup(GroupAligner):
     def reset(self) -> None:
         """Forget all frames."""
         self._aligners.clear()
+        self._times.clear()
 
     def forget(self, agent: str) -> None:
         """Forget the pairs with this agent."""
-        self._aligners = {pair: aligner for pair, aligner in self._aligners.items() if agent not in pair}
+        for pair in [pair for pair in self._aligners if agent in pair]:
+            del self._aligners[pair]
+            self._times.pop(pair, None)
 
     def _judge(self, direct: Alignment, found: _Pose, ego: Boxes, other: Boxes, names: list[str]) -> Alignment:
         """The alignment of an agent, from that with the ego alone and from the group's pose."""

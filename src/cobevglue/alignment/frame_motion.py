@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
+from cobevglue.clock import SHORTEST_STEP
 from cobevglue.se2 import SE2
 from cobevglue.typing import FloatArray, IntArray
 
@@ -67,7 +68,7 @@ class FrameMotion:
             dt: time since the last list [s]; a list that is no later is the last one again.
             is_vehicle: the frame is known to be a vehicle's.
         """
-        if dt <= 0.0:
+        if dt < SHORTEST_STEP:
             return self._velocities if len(self._velocities) == len(rows) else np.zeros((len(rows), 2))
         self._tracks, self.twist, self.twist_variance, motion = self._follow(
             self._tracks, self.twist, self.twist_variance, rows, ids, dt, self._noise

@@ -16,6 +16,7 @@ from cobevglue.cli.bench import bench
 from cobevglue.cli.demo import demo
 from cobevglue.cli.errors import InputError
 from cobevglue.cli.evaluate import evaluate
+from cobevglue.cli.node import node
 from cobevglue.cli.output import print_note
 from cobevglue.cli.replay import replay
 from cobevglue.cli.reproduce import reproduce
@@ -45,7 +46,7 @@ def _reflowed(text: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n"))
 
 
-for _command in (demo, align, simulate, train, evaluate, reproduce, bench, replay):
+for _command in (demo, align, simulate, train, evaluate, reproduce, bench, replay, node):
     app.command(help=_reflowed(_command.__doc__ or ""))(_command)
 
 
