@@ -146,7 +146,7 @@ def _map(shown: Sequence[Boxes]) -> tuple[Figure, Axes]:
     """A figure with one plot that holds all these boxes and the ego."""
     corners = np.concatenate([np.zeros((1, 2)), *(boxes.bev_corners().reshape(-1, 2) for boxes in shown)])
     (x_min, y_min), (x_max, y_max) = corners.min(axis=0) - 5.0, corners.max(axis=0) + 5.0
-    figure = new_figure(12.0, min(max(12.0 * (y_max - y_min) / (x_max - x_min), 3.0), 12.0) + 0.6)
+    figure = new_figure(12.0, min(max(12.0 * (y_max - y_min) / (x_max - x_min), 3.0), 12.0) + 1.2)  # with title, axis and legend
     (axes,) = add_axes(figure, 1, 1)
     axes.set_xlim(x_min, x_max)
     axes.set_ylim(y_min, y_max)
