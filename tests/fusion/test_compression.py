@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -76,6 +76,7 @@ def test_other_types_than_float16_arrive_as_sent() -> None:
     assert back["features"].shape == (0, 4)
 
 
+@settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 1.0))
 def test_exactly_the_most_confident_cells_travel(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -111,8 +112,8 @@ def test_fine_quantisation_hardly_changes_the_result(name: str) -> None:
 def test_fewer_cells_and_bits_cost_fewer_bytes(name: str) -> None:
     method, seen = made(name), checks.view(DETECTOR, 1)
 
-    def size(**settings: float) -> int:
-        return len(encode_arrays(CompressedFusion(method, Compression.model_validate(settings)).message(seen)))
+    def size(**options: float) -> int:
+        return len(encode_arrays(CompressedFusion(method, Compression.model_validate(options)).message(seen)))
 
     assert size(bits=8) < 0.6 * len(encode_arrays(method.message(seen)))
     assert size(bits=2, cells=0.1) < size(bits=8, cells=0.1) < size(bits=8, cells=0.5) < size(bits=8)
@@ -132,26 +133,36 @@ def test_unsent_cells_count_as_out_of_reach(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "message"),
+    ("name", "options", "message"),
     [
         ("late", {}, "LateFusion sends boxes, only features can be compressed"),
         ("where2comm", {"cells": 0.5}, "cells: Where2comm sends no whole maps"),
         ("fpv-rcnn", {"cells": 0.5}, "cells: FPVRCNN sends no whole maps"),
     ],
 )
-def test_what_cannot_be_compressed_is_refused(name: str, settings: dict[str, float], message: str) -> None:
+def test_what_cannot_be_compressed_is_refused(name: str, options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        CompressedFusion(FUSION_METHODS[name](DETECTOR), Compression.model_validate(settings))
+        CompressedFusion(FUSION_METHODS[name](DETECTOR), Compression.model_validate(options))
 
 
-@pytest.mark.parametrize("settings", [{"bits": 1}, {"bits": 9}, {"cells": 0.0}, {"cells": 1.1}, {"bit": 8}])
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        Compression.model_validate(settings)
+@pytest.mark.parametrize("options", [{"bits": 1}, {"bits": 9}, {"cells": 0.0}, {"cells": 1.1}, {"bit": 8}])
+def test_settings_out_of_range_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Compression.model_validate(options)
 
 
 def coded(data: bytes) -> Arrays:
+    """As a sender's mistake, or malice, might have it."""
     return {"coded": np.frombuffer(data, np.uint8)}
+
+
+U1, U2, F4 = np.uint8, np.uint16, np.float32
+ONE_CELL: dict[str, np.ndarray] = {"sent": np.full(1, 128, U1), "sent/shape": np.ones(2, U2)}
+HUGE: dict[str, np.ndarray] = {
+    "map0": np.zeros((60000, 1), U1),
+    "map0/range": np.zeros((2, 60000, 1), F4),
+    "map0/shape": np.full(2, 60000, U2),
+}
 
 
 @pytest.mark.parametrize(
@@ -162,10 +173,12 @@ def coded(data: bytes) -> Arrays:
         coded(b"not zlib"),
         coded(zlib.compress(encode_arrays({"a": np.zeros(9)}))[:-8]),
         coded(zlib.compress(b"no arrays")),
-        coded(zlib.compress(encode_arrays({"sent": np.zeros(1, np.uint8)}))),
-        coded(zlib.compress(encode_arrays({"a": np.zeros(3, np.uint8), "a/range": np.zeros(5, np.float32)}))),
+        coded(zlib.compress(encode_arrays({"sent": np.zeros(1, U1)}))),
+        coded(zlib.compress(encode_arrays({"sent": np.zeros(1, U1), "sent/shape": np.full(2, 60000, U2)}))),
+        coded(zlib.compress(encode_arrays({**ONE_CELL, **HUGE}))),
+        coded(zlib.compress(encode_arrays({"a": np.zeros(3, U1), "a/range": np.zeros(5, F4)}))),
     ],
-    ids=["nothing", "not compressed", "not zlib", "cut short", "no arrays", "no shape", "wrong range"],
+    ids=["nothing", "raw", "not zlib", "cut short", "no arrays", "no shape", "few cells", "huge map", "wrong range"],
 )
 def test_damaged_messages_are_refused(content: Arrays) -> None:
     with pytest.raises(MessageError, match="compressed message"):

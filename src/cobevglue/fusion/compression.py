@@ -13,6 +13,7 @@ receiver), fewer bits have the better average precision at equal bytes: `docs/co
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -145,7 +146,7 @@ def decompress(content: Arrays) -> Arrays:
     try:
         data = decoder.decompress(content[_CODED].tobytes(), _MOST_BYTES)
         if not decoder.eof:
-            raise MessageError(f"compressed message: cut short, or more than {_MOST_BYTES:,} bytes")
+            raise ValueError(f"cut short, or more than {_MOST_BYTES:,} bytes")
         return _restored(decode_arrays(data))
     except (zlib.error, KeyError, IndexError, TypeError, ValueError) as error:
         raise MessageError(f"compressed message: {error}") from None
@@ -156,6 +157,8 @@ def _restored(parts: Arrays) -> Arrays:
     cells = None
     if _SENT in parts:
         rows, columns = parts[_SENT + _SHAPE].tolist()
+        if len(parts[_SENT]) != -(-rows * columns // 8):
+            raise ValueError(f"{len(parts[_SENT])} bytes for the {rows} x {columns} cells")
         cells = np.unpackbits(parts[_SENT], count=rows * columns).reshape(rows, columns).astype(bool)
         content[_SENT] = cells
     for name, array in parts.items():
@@ -168,6 +171,8 @@ def _restored(parts: Arrays) -> Arrays:
         values = low + step * array.astype(np.float32)
         if cells is not None and name + _SHAPE in parts:
             shape = tuple(parts[name + _SHAPE].tolist())
+            if 4 * len(values) * math.prod(shape) > _MOST_BYTES:
+                raise ValueError(f"{name}: {len(values)} channels of {shape} cells are more than {_MOST_BYTES:,} bytes")
             whole = np.zeros((len(values), *shape), np.float32)
             whole[:, _at_scale(cells, shape)] = values
             values = whole
