@@ -19,7 +19,7 @@ from cobevglue.alignment import Alignment, group_aligner
 from cobevglue.alignment.group import GroupAligner, Observation
 from cobevglue.boxes import Boxes, covers_origin
 from cobevglue.datasets.frame import did_you_mean
-from cobevglue.fusion import FusionMethod, Received, pretrained_fusion
+from cobevglue.fusion import CompressedFusion, Compression, FusionMethod, Received, pretrained_fusion
 from cobevglue.fusion.heading import vote_headings
 from cobevglue.fusion.none import NoCollaboration
 from cobevglue.messages import decode_arrays, encode_arrays
@@ -68,21 +68,31 @@ class CoBEVGlue:
         self._frame = 0
 
     @classmethod
-    def pretrained(cls, name: str, fusion: str = "cobevglue", aligner: str | None = None) -> CoBEVGlue:
+    def pretrained(
+        cls,
+        name: str,
+        fusion: str = "cobevglue",
+        aligner: str | None = None,
+        compression: Compression | None = None,
+    ) -> CoBEVGlue:
         """The system on the weights that come with the package.
 
         Args:
             name: of the detector: "compact", or "opv2v", for which fusion has to be "late", "early" or "none".
             fusion: a name in `FUSION_METHODS`.
             aligner: a name in `ALIGNERS`; None for that of the method's paper.
+            compression: of the transmitted features; None for none.
 
         Raises:
-            ValueError: an unknown name; names the nearest.
+            ValueError: an unknown name (names the nearest), or messages that cannot be compressed so.
         """
         detector = PointPillars.pretrained(name)
         method = pretrained_fusion(fusion, detector, name)
-        folded = fold_batch_norm(method) if isinstance(method, nn.Module) else method
-        return cls(fold_batch_norm(detector), folded, group_aligner(aligner or method.usual_aligner))
+        if isinstance(method, nn.Module):
+            method = fold_batch_norm(method)
+        if compression is not None:
+            method = CompressedFusion(method, compression)
+        return cls(fold_batch_norm(detector), method, group_aligner(aligner or method.usual_aligner))
 
     def reset(self) -> None:
         """Forget all tracks and poses: the next frame is the first of another sequence."""

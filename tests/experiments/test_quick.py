@@ -52,6 +52,14 @@ def test_it_pays_to_see_together(tables: dict[str, Rows]) -> None:
     assert given["2.5/2.5"] < given["0.0/0.0"] - 0.02
 
 
+def test_compression_saves_bytes_and_keeps_precision(tables: dict[str, Rows]) -> None:
+    rows = tables["bandwidth"]  # of a method the last row, which is compressed
+    row = rows["CoBEVGlue"]
+    assert (row["bits"], row["cells"]) == (3, 0.05)
+    assert row["bytes"] < 0.02 * tables["communication"]["CoBEVGlue"]["bytes"]
+    assert row["AP@0.5"] > rows["No collaboration"]["AP@0.5"]
+
+
 def test_bevglue_adds_few_bytes(tables: dict[str, Rows]) -> None:
     row = tables["communication"]["CoBEVGlue"]
     assert 0.0 < row["bytes for alignment"] < 1e-3 * row["bytes"]

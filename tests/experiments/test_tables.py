@@ -17,7 +17,7 @@ from cobevglue.experiments.table import Table
 from cobevglue.experiments.tables import EXPERIMENTS, FULL, QUICK, Scope, conditions_of, experiments_named
 from cobevglue.experiments.tables.scope import as_is, attacked, method_title
 from cobevglue.experiments.tables.summary import summary
-from cobevglue.fusion import FUSION_METHODS
+from cobevglue.fusion import FUSION_METHODS, Compression
 
 from .tiny import tiny_settings, write_agent
 
@@ -140,6 +140,19 @@ def test_communication_is_what_was_sent(results: Results) -> None:
     assert isinstance(sent["CoBEVGlue"], float)
     assert column(made, "log2")["CoBEVGlue"] == pytest.approx(math.log2(sent["CoBEVGlue"]))
     assert column(made, "bytes for alignment")["Late fusion"] == 153.0  # a pose in float64
+
+
+def test_bandwidth_compresses_every_method_with_features(results: Results) -> None:
+    made = table(results, "bandwidth", "bandwidth")
+    assert [row[0] for row in made.rows if row[2] is None] == [method_title(name) for name in FUSION_METHODS]
+    compressed = {row[0]: row for row in made.rows if row[2] is not None}
+    assert set(compressed) == {method_title(name) for name in FUSION_METHODS if name not in ("none", "late", "early")}
+    assert compressed["CoBEVGlue"][2:4] == [3, 0.05]
+    assert compressed["Where2comm"][2:4] == [3, 1.0]
+    condition = as_is("cobevglue", compression=Compression(bits=3, cells=0.05))
+    every = QUICK.bandwidth_every
+    sent = results.payload_bytes(condition, every) + results.alignment_bytes(condition, every)
+    assert compressed["CoBEVGlue"][4] == sent < 0.3 * results.payload_bytes(as_is("cobevglue"))
 
 
 def test_the_summary_leaves_out_what_was_not_run(results: Results) -> None:

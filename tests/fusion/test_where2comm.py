@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cobevglue.fusion import fusion_class
-from cobevglue.fusion.where2comm import ConfidenceAttention, Where2comm, _sinusoids, _smoothed
+from cobevglue.fusion.where2comm import ConfidenceAttention, Where2comm, _sinusoids, smoothed
 from cobevglue.messages import encode_arrays
 from cobevglue.perception import PerceptionOutput
 from cobevglue.se2 import SE2
@@ -32,7 +32,7 @@ def threshold_for(seen: PerceptionOutput, count: int) -> float:
     """The threshold at which so many cells are selected: halfway between the last of them and the next."""
     with torch.inference_mode():
         _, confidence, _ = method_with(0.0).share([m[None] for m in seen.features])
-        ordered = _smoothed(confidence).flatten().sort(descending=True).values.double()
+        ordered = smoothed(confidence).flatten().sort(descending=True).values.double()
     return float(ordered[count - 1] + ordered[count]) / 2 if count < len(ordered) else 0.0
 
 

@@ -61,6 +61,11 @@ def test_only_long_cells_are_broken_into_lines(tmp_path: Path) -> None:
     )
 
 
+def test_tables_and_pictures_scroll_by_themselves() -> None:
+    assert table(["name"], [["a"]]).startswith('<div class="scroll"><table>')
+    assert figure(PIXEL).startswith('<figure><div class="scroll"><img')
+
+
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row 1 has 1 cells, the table has 2 columns"):
         table(["a", "b"], [["1", "2"], ["3"]])

@@ -48,7 +48,7 @@ def reproduce(
         str | None,
         typer.Option(
             help="Only these, separated by commas: noise, attack, registration, ablation, disturbances, pose, "
-            "communication, time."
+            "communication, bandwidth, time."
         ),
     ] = None,
     methods: Annotated[
@@ -80,8 +80,8 @@ def reproduce(
     """Reproduce the paper's tables and figures on simulated sequences or on a data set.
 
     Every fusion method under localisation noise and attack, point cloud registration, ablation, other disturbances,
-    pose accuracy, communication volume and run time. Writes index.html, report.md and CSV files; for a data set of the
-    paper, the published numbers are shown, too.
+    pose accuracy, communication volume, average precision over bandwidth, and run time. Writes index.html, report.md
+    and CSV files; for a data set of the paper, the published numbers are shown, too.
 
     Results are stored in the folder: the same command resumes an interrupted run, and with other --tables computes only
     missing results.

@@ -10,6 +10,7 @@ from pydantic import Field
 from cobevglue.alignment import ALIGNERS
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.disturbance import Disturbance, disturbance
+from cobevglue.fusion import Compression
 from cobevglue.settings import Settings
 
 __all__ = ["Condition"]
@@ -27,6 +28,7 @@ class Condition(Settings):
         true_poses: aligners that need poses use the true ones instead of the claimed ones: the oracle.
         forget: the aligner is reset before each frame.
         every: step between the frames that are run.
+        compression: of the transmitted features; None for none.
 
     Raises:
         ValueError: no such aligner, disturbance or option (names the nearest), or a value out of its range.
@@ -40,6 +42,7 @@ class Condition(Settings):
     true_poses: bool = False
     forget: bool = False
     every: Annotated[int, Field(ge=1)] = 1
+    compression: Compression | None = None
 
     def model_post_init(self, _: Any) -> None:
         """Check that the condition can be run."""

@@ -75,9 +75,9 @@ class Results:
             for pose in frame.received:
                 yield truth.co_visible.get(pose.agent, 0), pose
 
-    def payload_bytes(self, condition: Condition) -> float:
+    def payload_bytes(self, condition: Condition, every: int = 1) -> float:
         """Mean bytes for fusion that one collaborator sends in one frame; NaN without any."""
-        poses = [pose for _, pose in self.received_poses(condition)]
+        poses = [pose for _, pose in self.received_poses(condition, every)]
         return _mean([sum(pose.message_bytes.values()) - pose.alignment_bytes for pose in poses])
 
     def alignment_bytes(self, condition: Condition, every: int = 1) -> float:

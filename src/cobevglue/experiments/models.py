@@ -12,7 +12,14 @@ from cobevglue.alignment import BEVGlueConfig, group_aligner
 from cobevglue.alignment.group import GroupAligner
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.study import StudySettings
-from cobevglue.fusion import FusionMethod, IntermediateFusion, fusion_class, pretrained_fusion, weights_name
+from cobevglue.fusion import (
+    CompressedFusion,
+    FusionMethod,
+    IntermediateFusion,
+    fusion_class,
+    pretrained_fusion,
+    weights_name,
+)
 from cobevglue.perception import PointPillars
 from cobevglue.perception.checkpoint import fingerprint
 from cobevglue.torch_device import chosen_device
@@ -69,6 +76,15 @@ class Models:
                 method.to(self.detector.device).eval()
             self._methods[name] = method
         return self._methods[name]
+
+    def fusion(self, condition: Condition) -> FusionMethod:
+        """The fusion method of a condition, with its compression.
+
+        Raises:
+            ValueError: as `method`; or its messages cannot be compressed so.
+        """
+        method = self.method(condition.fusion)
+        return method if condition.compression is None else CompressedFusion(method, condition.compression)
 
     def _make(self, name: str) -> FusionMethod:
         settings = self._settings

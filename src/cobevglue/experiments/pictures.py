@@ -17,6 +17,7 @@ from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
 from cobevglue.experiments.observed_sequence import ObservedSequence
 from cobevglue.experiments.study import StudySettings, open_sequence, sequence_frames, sequence_names
+from cobevglue.experiments.tables.bandwidth import bandwidth_points
 from cobevglue.experiments.tables.noise import noise_curves
 from cobevglue.experiments.tables.registration import registration_points
 from cobevglue.experiments.tables.scope import Scope, aligner_title, as_is, method_title, needs
@@ -24,7 +25,7 @@ from cobevglue.se2 import SE2
 from cobevglue.system import CoBEVGlue, StepOutput
 from cobevglue.typing import FloatArray
 
-__all__ = ["Picture", "noise_pictures", "registration_pictures", "scene_pictures"]
+__all__ = ["Picture", "bandwidth_pictures", "noise_pictures", "registration_pictures", "scene_pictures"]
 
 Picture = tuple[str, bytes]
 """Caption and PNG file."""
@@ -57,6 +58,17 @@ def registration_pictures(scope: Scope, results: Results) -> list[Picture]:
 
     title = "AP@0.5 over bytes sent for alignment"
     return [(title, ap_over_bytes(registration_points(scope, results, 0.5), title))]
+
+
+def bandwidth_pictures(scope: Scope, results: Results) -> list[Picture]:
+    """Average precision over all bytes, on a scale of base 2."""
+    from cobevglue.visualization.study_figures import ap_over_bytes
+
+    pictures = []
+    for iou in (0.5, 0.7):
+        title = f"AP@{iou:g} over bytes of a collaborator"
+        pictures.append((title, ap_over_bytes(bandwidth_points(scope, results, iou), title, base=2)))
+    return pictures
 
 
 def scene_pictures(settings: StudySettings, models: Models, scope: Scope) -> list[Picture]:
@@ -113,7 +125,7 @@ def _run(
     condition: Condition, sequence: ObservedSequence, models: Models, seed: int, last_only: bool = False
 ) -> StepOutput:
     """The output for the last frame; unless `last_only`, all frames before it are run, too."""
-    system = CoBEVGlue(models.detector, models.method(condition.fusion), models.aligner(condition))
+    system = CoBEVGlue(models.detector, models.fusion(condition), models.aligner(condition))
     disturbance = condition.make_disturbance()
     last = len(sequence.frames) - 1
     for index in range(last if last_only else 0, last + 1):

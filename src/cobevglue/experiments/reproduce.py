@@ -7,7 +7,13 @@ from pathlib import Path
 
 from cobevglue.experiments.measure import Results
 from cobevglue.experiments.models import Models
-from cobevglue.experiments.pictures import Picture, noise_pictures, registration_pictures, scene_pictures
+from cobevglue.experiments.pictures import (
+    Picture,
+    bandwidth_pictures,
+    noise_pictures,
+    registration_pictures,
+    scene_pictures,
+)
 from cobevglue.experiments.report import Part, write_report
 from cobevglue.experiments.runner import run_study
 from cobevglue.experiments.study import StudySettings, sequence_names
@@ -81,4 +87,6 @@ def _pictures(
         pictures["noise"] = noise_pictures(scope, results)
     if "registration" in names:
         pictures["registration"] = registration_pictures(scope, results)
+    if "bandwidth" in names:
+        pictures["bandwidth"] = bandwidth_pictures(scope, results)
     return pictures

@@ -56,17 +56,21 @@ def run_sequence(
         ValueError: a broken file; names it.
     """
     observed = ObservedSequence(models.detector)
-    memos = {condition.fusion: MessageMemo(models.method(condition.fusion)) for condition in conditions}
-    runs = [_Run(condition, models, memos[condition.fusion], (settings.seed, number)) for condition in conditions]
-    runs.sort(key=lambda run: list(memos).index(run.condition.fusion))  # so that only one memo is full at a time
+    sent = [(condition.fusion, condition.compression) for condition in conditions]
+    memos = {key: MessageMemo(models.fusion(condition)) for key, condition in zip(sent, conditions, strict=True)}
+    runs = [
+        _Run(condition, models, memos[key], (settings.seed, number))
+        for key, condition in zip(sent, conditions, strict=True)
+    ]
+    runs.sort(key=lambda run: list(memos).index(run.sends))  # so that only one memo is full at a time
     frames = iter(sequence_frames(settings, sequence))
     while block := list(islice(frames, _BLOCK)):
         new = observed.observe(block)
         progress(PERCEPTION_COST * len(block))
-        fusion = ""
+        sends = None
         for run in runs:
-            if run.condition.fusion != fusion:
-                fusion = run.condition.fusion
+            if run.sends != sends:
+                sends = run.sends
                 for memo in memos.values():
                     memo.clear()
             for index in new:
@@ -92,6 +96,7 @@ class _Run:
 
     def __init__(self, condition: Condition, models: Models, memo: MessageMemo, key: tuple[int, ...]) -> None:
         self.condition = condition
+        self.sends = condition.fusion, condition.compression
         self.frames: dict[int, FrameResult] = {}
         self._memo = memo
         self._system = CoBEVGlue(models.detector, memo, models.aligner(condition))

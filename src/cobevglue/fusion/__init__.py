@@ -7,6 +7,7 @@ from pathlib import Path
 from cobevglue.datasets.frame import did_you_mean
 from cobevglue.fusion.coalign import CoAlign
 from cobevglue.fusion.cobevglue import MaxFusion, MaxFusionWithBoxes
+from cobevglue.fusion.compression import CompressedFusion, Compression
 from cobevglue.fusion.disconet import DiscoNet
 from cobevglue.fusion.early import EarlyFusion
 from cobevglue.fusion.f_cooper import FCooper
@@ -23,6 +24,8 @@ from cobevglue.perception import PointPillars
 
 __all__ = [
     "FUSION_METHODS",
+    "CompressedFusion",
+    "Compression",
     "FusionMethod",
     "FusionSample",
     "IntermediateFusion",

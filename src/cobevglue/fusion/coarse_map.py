@@ -54,8 +54,10 @@ class CoarseMapFusion(IntermediateFusion):
         rows, columns, _ = self.config.head_shape
         return [shared, shared.new_zeros(self.config.shrink_channels, rows, columns)]
 
-    def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
-        return [*super()._fuse(maps[:1], ego_SE2_agent), maps[1][0]]
+    def _fuse(
+        self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2], sent: Sequence[Tensor] | None = None
+    ) -> list[Tensor]:
+        return [*super()._fuse(maps[:1], ego_SE2_agent, sent), maps[1][0]]
 
     def decode_maps(self, maps: Sequence[Tensor]) -> HeadOutput:
         """The fused map back to stride 2, added to the ego's own there, and the head."""

@@ -77,6 +77,7 @@ class FPVRCNN(SingleMapFusion):
     """
 
     usual_aligner = "fpv-rcnn"
+    shares_maps = False
     proposal_score: float = 0.1
 
     def __init__(self, detector: PointPillars) -> None:

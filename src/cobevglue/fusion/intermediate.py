@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -35,7 +36,7 @@ from cobevglue.se2 import SE2
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["FusionSample", "IntermediateFusion", "MultiScaleFusion", "SingleMapFusion"]
+__all__ = ["FusionSample", "IntermediateFusion", "MultiScaleFusion", "SingleMapFusion", "pooled"]
 
 _LARGEST = 65504.0  # of float16
 
@@ -72,10 +73,12 @@ class IntermediateFusion(FusionMethod, nn.Module):
         training_noise: standard deviation of x and y [m] and yaw [degrees] of every agent's pose in training, as the
             method's paper has it.
         learns_from_merged_clouds: whether `loss` uses `FusionSample.early_features`.
+        shares_maps: whether a message is whole maps, of which a compressed one may have some cells only.
     """
 
     training_noise: ClassVar[tuple[float, float]] = (0.0, 0.0)
     learns_from_merged_clouds: ClassVar[bool] = False
+    shares_maps: ClassVar[bool] = True
 
     def __init__(self, detector: PointPillars) -> None:
         nn.Module.__init__(self)
@@ -128,24 +131,29 @@ class IntermediateFusion(FusionMethod, nn.Module):
         ]
         return [torch.stack(scale) for scale in zip(*fused, strict=True)]
 
-    def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
-        """Warp and fuse maps (n, C, H, W) of n agents, the ego first."""
-        placed = [self.placed(m, ego_SE2_agent, i) for i, m in enumerate(maps)]
+    def _fuse(
+        self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2], sent: Sequence[Tensor] | None = None
+    ) -> list[Tensor]:
+        """Warp and fuse maps (n, C, H, W) of n agents, the ego first; `sent`: of each map as `placed` has it."""
+        placed = [self.placed(m, ego_SE2_agent, i, None if sent is None else sent[i]) for i, m in enumerate(maps)]
         return self.fuse_maps([m for m, _ in placed], [covered for _, covered in placed])
 
-    def placed(self, maps: Tensor, ego_SE2_agent: Sequence[SE2], index: int) -> tuple[Tensor, Tensor]:
+    def placed(
+        self, maps: Tensor, ego_SE2_agent: Sequence[SE2], index: int, sent: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Maps of agents, warped to the ego frame and rotation-conditioned.
 
         Args:
             maps: (B, C, H, W) shared maps of B agents.
             ego_SE2_agent: B poses, the ego's own may be among them.
             index: of the shared map.
+            sent: (B, 1, H, W) 1 in the cells that were sent, 0 in others; None where all were.
 
         Returns:
             (B, C, H, W), and their coverage of each cell, (B, 1, H, W).
         """
         warped = warp(maps, ego_SE2_agent, self.config)
-        covered = coverage(maps, ego_SE2_agent, self.config)
+        covered = coverage(maps, ego_SE2_agent, self.config) if sent is None else warp(sent, ego_SE2_agent, self.config)
         if index < len(self.conditioning):
             warped = self.conditioning[index](warped, [pose.yaw for pose in ego_SE2_agent], covered)
         return warped, covered
@@ -168,8 +176,15 @@ class IntermediateFusion(FusionMethod, nn.Module):
 
     def received_maps(self, content: Arrays) -> list[Tensor]:
         """The maps (C, H, W) of a message."""
-        number = sum(name.startswith("map") for name in content)
-        return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(number)]
+        count = sum(name.startswith("map") for name in content)
+        return [torch.from_numpy(content[f"map{i}"].astype(np.float32)) for i in range(count)]
+
+    @torch.inference_mode()
+    def confidence(self, observation: PerceptionOutput) -> Tensor:
+        """(1, 1, H, W) the best score of any anchor in each cell at stride 2, from the agent's own maps."""
+        own = self.share([m[None] for m in observation.features])
+        output = self.decode_maps([m[None] for m in self._fuse(own, [SE2()])])
+        return output.logits.view(1, *self.config.head_shape).amax(dim=-1)[:, None].sigmoid()
 
     @torch.inference_mode()
     def fuse(self, ego: PerceptionOutput, received: Sequence[Received]) -> Boxes:
@@ -177,7 +192,8 @@ class IntermediateFusion(FusionMethod, nn.Module):
         own = self.share([m[None] for m in ego.features])
         others = [self.received_maps(other.content) for other in received]
         maps = [torch.cat([m, *(o[i][None].to(m) for o in others)]) for i, m in enumerate(own)]
-        fused = self._fuse(maps, [SE2(), *(other.ego_SE2_other for other in received)])
+        poses = [SE2(), *(other.ego_SE2_other for other in received)]
+        fused = self._fuse(maps, poses, _sent(own, [other.content for other in received]))
         (found,) = self.boxes(self.decode_maps([m[None] for m in fused]))
         return found.boxes
 
@@ -253,6 +269,23 @@ class SingleMapFusion(IntermediateFusion):
         """The head."""
         output: HeadOutput = self.head(maps[0])
         return output
+
+
+def pooled(mask: Tensor, shape: Sequence[int]) -> Tensor:
+    """(n, H, W) of a coarser map of this shape: the maximum over the cells of `mask`, (n, rows, columns), in each."""
+    return F.adaptive_max_pool2d(mask, list(shape))
+
+
+def _sent(own: Sequence[Tensor], messages: Sequence[Arrays]) -> list[Tensor] | None:
+    """Of each map (n, 1, H, W) 1 in the cells that were sent, the ego's first; None where all messages are whole."""
+    if not any("sent" in content for content in messages):
+        return None
+    sent = []
+    for m in own:
+        ones = torch.ones_like(m[:, 0])
+        masks = [pooled(ones.new_tensor(c["sent"])[None], m.shape[2:]) if "sent" in c else ones for c in messages]
+        sent.append(torch.stack([ones, *masks]))
+    return sent
 
 
 def _half(values: Tensor) -> NDArray[np.float16]:

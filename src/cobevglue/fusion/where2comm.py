@@ -19,7 +19,7 @@ from cobevglue.messages import Arrays
 from cobevglue.perception import PerceptionOutput, PointPillars
 from cobevglue.se2 import SE2
 
-__all__ = ["ConfidenceAttention", "Where2comm"]
+__all__ = ["ConfidenceAttention", "Where2comm", "smoothed"]
 
 _WAVELENGTHS = (8.0, 24.0, 72.0, 216.0)
 """Of the positional encoding of distances to a sensor [m]."""
@@ -45,6 +45,7 @@ class Where2comm(SingleMapFusion):
             a head trained with the focal loss predicts for empty road: two thirds of all cells would be sent.
     """
 
+    shares_maps = False
     threshold: float = 0.05
     distance: Tensor
 
@@ -60,16 +61,16 @@ class Where2comm(SingleMapFusion):
     def share(self, features: Sequence[Tensor]) -> list[Tensor]:
         """The neck's map, its confidence (B, 1, H, W), and 1 where a cell is selected, 0 elsewhere (B, 1, H, W)."""
         (shared,) = super().share(features)
-        confidence = self.confidence(shared)
+        confidence = self.cell_confidence(shared)
         return [shared, confidence, self._selected(confidence.detach())]
 
-    def confidence(self, shared: Tensor) -> Tensor:
+    def cell_confidence(self, shared: Tensor) -> Tensor:
         """(B, 1, H, W) best score of any anchor in each cell of the neck's map (B, C, H, W)."""
         logits: Tensor = self.head.logits(shared)
         return logits.amax(dim=1, keepdim=True).sigmoid()
 
     def _selected(self, confidence: Tensor) -> Tensor:
-        smooth = _smoothed(confidence)
+        smooth = smoothed(confidence)
         if not self.training:
             return (smooth >= self.threshold).to(smooth)
         agents = len(smooth)
@@ -77,7 +78,9 @@ class Where2comm(SingleMapFusion):
         rank = smooth.flatten(1).argsort(dim=1, descending=True).argsort(dim=1)
         return (rank < fraction * rank.shape[1]).to(smooth).view_as(smooth)
 
-    def _fuse(self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2]) -> list[Tensor]:
+    def _fuse(
+        self, maps: Sequence[Tensor], ego_SE2_agent: Sequence[SE2], sent: Sequence[Tensor] | None = None
+    ) -> list[Tensor]:
         shared, confidence, selected = maps
         selected = torch.cat([torch.ones_like(selected[:1]), selected[1:]])
         distance = self.distance.expand_as(selected)
@@ -122,7 +125,7 @@ class Where2comm(SingleMapFusion):
         shared[:, cells] = torch.from_numpy(features.T).to(device)
         selected[:, cells] = 1.0
         shared, selected = shared.view(channels, rows, columns), selected.view(1, rows, columns)
-        return [shared, self.confidence(shared[None])[0] * selected, selected]
+        return [shared, self.cell_confidence(shared[None])[0] * selected, selected]
 
 
 class ConfidenceAttention(nn.Module):
@@ -179,7 +182,7 @@ def _sinusoids(distance: Tensor) -> Tensor:
     return torch.cat([angle.sin(), angle.cos()], dim=1)
 
 
-def _smoothed(values: Tensor) -> Tensor:
+def smoothed(values: Tensor) -> Tensor:
     """(B, 1, H, W) averaged by a Gaussian of one cell's deviation over 5 x 5 cells; 0 beyond the border."""
     line = torch.exp(-0.5 * torch.arange(-2.0, 3.0, device=values.device, dtype=values.dtype) ** 2)
     line = line / line.sum()

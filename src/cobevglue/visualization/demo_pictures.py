@@ -43,7 +43,7 @@ def draw_comparison(
         rows: keys of `ROWS`.
     """
     lines = (len(rows) + 1) // 2
-    figure = new_figure(14.0, 4.75 * lines + 0.5)
+    figure = new_figure(14.0, 5.1 * lines + 0.7)
     for axes, row in zip(add_axes(figure, lines, 2), rows, strict=False):
         draw_moment(axes, result.story(), row, result.roads)
     legend_below(figure, columns=4)

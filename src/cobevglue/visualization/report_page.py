@@ -22,7 +22,7 @@ _STYLE = """
   :root { --text: #e4e8ec; --page: #15181c; --line: #343a41; --faint: #9aa4ae; --good: #4fd1a5; --inset: #20252b;
           --link: #7cc0f0; } }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 74rem; color: var(--text); background: var(--page);
+body { margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 80rem; color: var(--text); background: var(--page);
        font: 17px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 a { color: var(--link); }
 h1 { font-size: 2rem; line-height: 1.2; margin: 0 0 0.6rem; }
@@ -42,10 +42,17 @@ tr.strong td { font-weight: 700; color: var(--good); }
 .scroll { overflow-x: auto; }
 .notes { margin: 0.2rem 0 1.2rem; padding-left: 1.2rem; max-width: 60rem; color: var(--faint); font-size: 0.88rem; }
 figure { margin: 1rem 0 1.6rem; }
-figure img { display: block; max-width: 100%; height: auto; border-radius: 6px; background: #ffffff; }
+figure img { display: block; max-width: max(100%, 42rem); height: auto; border-radius: 6px; background: #ffffff; }
 figcaption { max-width: 60rem; margin-top: 0.4rem; color: var(--faint); font-size: 0.92rem; }
 footer { margin-top: 3rem; padding-top: 0.8rem; border-top: 1px solid var(--line); color: var(--faint);
          font-size: 0.9rem; }
+@media (max-width: 48rem) {
+  body { padding: 1.5rem 1rem 3rem; font-size: 16px; }
+  table { font-size: 0.84rem; }
+  th, td, td.text { padding: 0.4rem 0.7rem 0.4rem 0; white-space: normal; min-width: 0; }
+  td.text { min-width: 9rem; }
+  th:first-child, td:first-child { position: sticky; left: 0; min-width: 6.5rem; max-width: 9.5rem;
+                                   background: var(--page); } }
 """
 
 
@@ -81,7 +88,7 @@ def paragraphs(text: str) -> str:
 def table(
     header: Sequence[str], rows: Sequence[Sequence[str]], strong: Container[int] = (), notes: Sequence[str] = ()
 ) -> str:
-    """A table of text, which scrolls by itself where it is wider than the page.
+    """A table of text, which scrolls by itself where it is wider than the page; the names of its rows stay in sight.
 
     Args:
         header: the names of the columns.
@@ -111,7 +118,7 @@ def _cell(text: str) -> str:
 
 
 def figure(png: bytes, caption: str = "", text: str = "") -> str:
-    """A picture with its caption.
+    """A picture with its caption, which scrolls by itself where the page is too narrow for its text to be read.
 
     Args:
         png: the picture as the bytes of a PNG file.
@@ -124,7 +131,7 @@ def figure(png: bytes, caption: str = "", text: str = "") -> str:
     if not png.startswith(b"\x89PNG\r\n"):
         raise ValueError(f"figure {caption!r}: not a PNG file, it starts with {png[:8]!r}")
     data = base64.b64encode(png).decode("ascii")
-    image = f'<img src="data:image/png;base64,{data}" alt="{escape(text or caption)}">'
+    image = f'<div class="scroll"><img src="data:image/png;base64,{data}" alt="{escape(text or caption)}"></div>'
     return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
 
 

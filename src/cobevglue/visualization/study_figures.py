@@ -72,7 +72,7 @@ def ap_over_noise(levels: Sequence[str], curves: Mapping[str, Sequence[float]], 
     return figure_png(figure)
 
 
-def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str) -> bytes:
+def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str, base: float = 10.0) -> bytes:
     """Average precision over communication volume.
 
     Points with equal labels are joined by a line; labels that start the same, up to the first comma or else the first
@@ -81,6 +81,7 @@ def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str) -> byt
     Args:
         points: label, bytes a frame, average precision.
         title: of the figure.
+        base: of the logarithmic scale of bytes.
     """
     figure = new_figure(8.6, 4.8)
     (axes,) = add_axes(figure, 1, 1)
@@ -101,7 +102,7 @@ def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str) -> byt
             marker: dict[str, Any] = {"marker": "*" if ours else _MARKERS[number % len(_MARKERS)]}
             marker |= {"markersize": 15.0 if ours else 8.0, "markeredgecolor": "white", "zorder": 4.0 if ours else 3.0}
             axes.plot(sizes[sizes > 0], values[sizes > 0], color=color, linewidth=1.2, label=label, **marker)
-    axes.set_xscale("log")
+    axes.set_xscale("log", base=base)
     axes.set_xlabel("communication [bytes a frame]")
     _finish(figure, axes, title)
     return figure_png(figure)
@@ -146,7 +147,9 @@ def _map(shown: Sequence[Boxes]) -> tuple[Figure, Axes]:
     """A figure with one plot that holds all these boxes and the ego."""
     corners = np.concatenate([np.zeros((1, 2)), *(boxes.bev_corners().reshape(-1, 2) for boxes in shown)])
     (x_min, y_min), (x_max, y_max) = corners.min(axis=0) - 5.0, corners.max(axis=0) + 5.0
-    figure = new_figure(12.0, min(max(12.0 * (y_max - y_min) / (x_max - x_min), 3.0), 12.0) + 0.6)
+    figure = new_figure(
+        12.0, min(max(12.0 * (y_max - y_min) / (x_max - x_min), 3.0), 12.0) + 1.2
+    )  # with title, axis and legend
     (axes,) = add_axes(figure, 1, 1)
     axes.set_xlim(x_min, x_max)
     axes.set_ylim(y_min, y_max)

@@ -8,6 +8,7 @@ from cobevglue.datasets.frame import did_you_mean
 from cobevglue.experiments.condition import Condition
 from cobevglue.experiments.tables.ablation import ABLATION
 from cobevglue.experiments.tables.attack import ATTACK_TABLE
+from cobevglue.experiments.tables.bandwidth import BANDWIDTH
 from cobevglue.experiments.tables.cost import COMMUNICATION, TIME
 from cobevglue.experiments.tables.disturbances import FURTHER
 from cobevglue.experiments.tables.noise import NOISE
@@ -19,7 +20,7 @@ __all__ = ["EXPERIMENTS", "FULL", "QUICK", "Experiment", "Scope", "conditions_of
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
-    for experiment in (NOISE, ATTACK_TABLE, REGISTRATION, ABLATION, FURTHER, POSE, COMMUNICATION, TIME)
+    for experiment in (NOISE, ATTACK_TABLE, REGISTRATION, ABLATION, FURTHER, POSE, COMMUNICATION, BANDWIDTH, TIME)
 }
 """By the name that users type, in the order of the report."""
 

@@ -65,6 +65,8 @@ class Scope:
         registration_levels: the same, for the initial poses of registration.
         budgets: what a collaborator may send for registration in a frame [bytes].
         registration_every: registration is run on every so many frames.
+        compressions: of transmitted features, (bits of a number, share of the cells that are sent).
+        bandwidth_every: the methods that trust poses are compressed on every so many frames.
         trusting_every: how often the methods that trust poses are run under further disturbances, as this is their own
             table's only and they do not remember.
         only: fusion methods to be compared with no collaboration and CoBEVGlue; None for all.
@@ -74,6 +76,8 @@ class Scope:
     registration_levels: Sequence[float] = (0.5, 1.5, 2.5)
     budgets: Sequence[int] = (1_000, 8_000, 64_000)
     registration_every: int = 4
+    compressions: Sequence[tuple[int, float]] = ((8, 1.0), (4, 1.0), (3, 0.3), (3, 0.05), (3, 0.01))
+    bandwidth_every: int = 4
     trusting_every: int = 4
     only: Sequence[str] | None = None
 
@@ -104,7 +108,15 @@ class Scope:
 
 
 FULL = Scope()
-QUICK = Scope(levels=(0.0, 2.5), registration_levels=(0.5,), budgets=(8_000,), registration_every=6, trusting_every=3)
+QUICK = Scope(
+    levels=(0.0, 2.5),
+    registration_levels=(0.5,),
+    budgets=(8_000,),
+    registration_every=6,
+    compressions=((3, 0.05),),
+    bandwidth_every=3,
+    trusting_every=3,
+)
 """Minutes, to see that everything works."""
 
 
