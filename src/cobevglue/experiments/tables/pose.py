@@ -27,7 +27,7 @@ _GROUPS: dict[str, tuple[int, float]] = {
 def _sources(scope: Scope) -> dict[str, str]:
     """The first method that uses each source of poses."""
     sources: dict[str, str] = {}
-    for name in (*scope.localised, *scope.trusting):
+    for name in (scope.ours, *scope.trusting):
         sources.setdefault(FUSION_METHODS[name].usual_aligner, name)
     return sources
 
