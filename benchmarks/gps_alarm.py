@@ -11,8 +11,8 @@
 Alignments are measured ones: BEVGlue on V2V4Real (own frames, own vehicles given; development: train, confirmation:
 val) and on simulated scenes with lists 0.1 s late (development: seeds
 0 to 15, confirmation: 100 to 115). Long drives are put together from them: blocks of up to 5 s, drawn at random with
-half of them from each source, with their errors, covariances and refusals as they were. Where an alignment is not accepted, nothing
-can be found; "aligned": accepted in 8 of the first 10 frames of the attack. Localisation is simulated:
+half of them from each source, with their errors, covariances and refusals as they were. Where no alignment is usable, nothing
+can be found; "aligned": usable in 8 of the first 10 frames of the attack. Localisation is simulated:
 claims are the truth plus a first-order Gauss-Markov process for each agent and component (time constant 60 s). The ego
 drives at 10 m/s. The data is read from $COBEVGLUE_DATA (default ../shared/data).
 """
@@ -58,7 +58,7 @@ SEQUENCES = {"development": V2V4REAL_TRAIN, "confirmation": V2V4REAL_VAL}
 SEED = {"development": 0, "confirmation": 1}
 FRAME, BLOCK, SPEED = 0.1, 50, 10.0
 TIME_CONSTANT = 60.0
-TRIALS, BEFORE = 200, 200
+TRIALS, BEFORE = 200, 100
 """Attacks of each kind, and honest frames before each."""
 POSITION_STDS = (0.5, 1.0)
 YAW_STD = math.radians(0.5)
@@ -250,7 +250,7 @@ def attacks(measured: list[list[list[Aligned]]], seed: int) -> Table:
     table: Table = []
     for position, (name, (attack, last)) in itertools.product(POSITION_STDS, ATTACKS.items()):
         spread = np.array([position, position, YAW_STD])
-        delays, seen, before = [], [], 0
+        delays, seen, before, monitor = [], [], 0, LocalisationMonitor()
         for trial in range(TRIALS):
             rng = np.random.default_rng([seed, 81, trial])
             rows = list(itertools.islice(blocks(measured, rng), BEFORE + last))
@@ -260,7 +260,7 @@ def attacks(measured: list[list[list[Aligned]]], seed: int) -> Table:
                 before += 1
             else:
                 delays.append(math.inf if found is None else FRAME * (found - BEFORE + 1))
-                seen.append(sum(row.alignment.accepted for row in rows[BEFORE : BEFORE + 10]) >= 8)
+                seen.append(sum(monitor.uses(row.alignment) for row in rows[BEFORE : BEFORE + 10]) >= 8)
         delay, aligned = np.array(delays), np.array(seen)
         table.append(
             {

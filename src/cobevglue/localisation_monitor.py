@@ -74,9 +74,9 @@ class LocalisationMonitorConfig(Settings):
     alignment_yaw_std: _Spread = math.radians(3.0)
     alignment_bias_std: _Spread = 0.3
     risk: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
-    margin: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    margin: Annotated[float, Field(ge=0.0, le=1.0)] = 0.55
     innovation: _Positive = 16.0
-    jump_time: _Positive = 0.6
+    jump_time: _Positive = 0.5
     offset: _Positive = 4.5
     clear_offset: _Positive = 3.5
     max_gap: _Positive = 10.0
@@ -114,14 +114,14 @@ class LocalisationReport:
         ego: name of the ego.
         pairs: the test of every pair that could be tested, in this frame or within `max_gap` before.
         faulty: agents whose claims are false. Empty where that cannot be told, as for two agents.
-        claims: by agent, ego_SE2_other of the claims and its (3, 3) covariance.
+        claims: by agent, (3,) of the claimed world_SE2_agent and its (3, 3) covariance.
     """
 
     time: float
     ego: str
     pairs: dict[Pair, PairTest]
     faulty: frozenset[str]
-    claims: dict[str, tuple[SE2, FloatArray]] = field(repr=False)
+    claims: dict[str, tuple[FloatArray, FloatArray]] = field(repr=False)
 
     @property
     def alarm(self) -> bool:
@@ -139,9 +139,10 @@ class LocalisationReport:
         None without claims, before the pair was tested, or if the claims are inconsistent.
         """
         test = self.pairs.get((self.ego, other))
-        if test is None or not test.consistent or {self.ego, other} & self.faulty:
+        if test is None or not test.consistent or {self.ego, other} & self.faulty or other not in self.claims:
             return None
-        return self.claims.get(other)
+        pose, covariance = relative(*self.claims[self.ego], *self.claims[other])
+        return to_se2(pose), covariance
 
 
 class LocalisationMonitor:
@@ -190,23 +191,18 @@ class LocalisationMonitor:
             known.update(now, *claims[a], *claims[b], a_SE2_b, covariance)
         self._pairs = {pair: known for pair, known in self._pairs.items() if now - known.time <= self.config.max_gap}
         tests = {pair: known.test() for pair, known in self._pairs.items()}
-        relative_claims = {}
-        for agent in claims:
-            if agent != ego:
-                pose, covariance = relative(*claims[ego], *claims[agent])
-                relative_claims[agent] = to_se2(pose), covariance
-        return LocalisationReport(now, ego, tests, faulty_agents(tests), relative_claims)
+        return LocalisationReport(now, ego, tests, faulty_agents(tests), claims)
+
+    def uses(self, alignment: Alignment) -> bool:
+        """Whether an alignment is certain enough to test a claim; not measured (NaN) counts as certain."""
+        low = alignment.margin < self.config.margin * alignment.evidence
+        return alignment.accepted and not (low or alignment.risk > self.config.risk)
 
     def reset(self) -> None:
         """Forget all frames and alarms."""
         self._clock.reset()
         self._pairs.clear()
         self._ego = None
-
-    def _unambiguous(self, alignment: Alignment) -> bool:
-        """Aligners that do not measure a risk or a margin (NaN) are believed."""
-        low = alignment.margin < self.config.margin * alignment.evidence
-        return not (low or alignment.risk > self.config.risk)
 
     def _measured(
         self, ego: str, claims: Mapping[str, tuple[FloatArray, FloatArray]], alignments: Mapping[str, Alignment]
@@ -218,7 +214,7 @@ class LocalisationMonitor:
             if agent in claims
             and alignment.ego_SE2_other is not None
             and np.isfinite(alignment.covariance).all()
-            and self._unambiguous(alignment)
+            and self.uses(alignment)
         }
         measured = {(ego, agent): pose for agent, pose in found.items()}
         for a, b in itertools.combinations(sorted(found), 2):
