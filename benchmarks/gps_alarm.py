@@ -44,6 +44,7 @@ from cobevglue.disturbance import (
     ReplayedPose,
     SamePlace,
 )
+from cobevglue.evaluation.alignment import AlignmentSequence
 from cobevglue.evaluation.alignment_data import V2V4REAL_TRAIN, V2V4REAL_VAL, v2v4real_car_sequences
 from cobevglue.evaluation.scene_data import scene_sequence
 from cobevglue.localisation_monitor import LocalisationMonitor, LocalisationMonitorConfig
@@ -114,7 +115,7 @@ def main() -> None:
     arguments = parser.parse_args()
     which, only = arguments.data, arguments.only
     if arguments.picture:
-        draw(arguments.picture, sources(DATA, which))
+        draw(arguments.picture)
         return
     print_head(f"{which} data, seed {SEED[which]}")
     tables: dict[str, Table] = {}
@@ -140,16 +141,7 @@ def sources(data: Path, which: str) -> list[list[list[Aligned]]]:
     for sequences in (real, scenes):
         found.append([])
         for sequence in sequences:
-            glue = BEVGlue()
-            rows = [
-                Aligned(
-                    frame.ego_SE2_other,
-                    glue.align(
-                        frame.ego, frame.other, frame.time, **known_bodies(frame.ego_body, frame.other_body)
-                    ),
-                )
-                for frame in sequence.frames
-            ]
+            rows = align(sequence)
             if len(rows) > BLOCK:
                 found[-1].append(rows)
     frames, accepted = (
@@ -158,6 +150,15 @@ def sources(data: Path, which: str) -> list[list[list[Aligned]]]:
     )
     print(f"{frames} measured alignments, {100.0 * accepted / frames:.1f} % accepted", file=sys.stderr)
     return found
+
+
+def align(sequence: AlignmentSequence) -> list[Aligned]:
+    """BEVGlue on a sequence."""
+    glue, rows = BEVGlue(), []
+    for frame in sequence.frames:
+        bodies = known_bodies(frame.ego_body, frame.other_body)
+        rows.append(Aligned(frame.ego_SE2_other, glue.align(frame.ego, frame.other, frame.time, **bodies)))
+    return rows
 
 
 def blocks(measured: list[list[list[Aligned]]], rng: np.random.Generator) -> Iterator[Aligned]:
@@ -337,9 +338,7 @@ def junction(seed: int, liar: str) -> tuple[set[str], float | None]:
             claimed[name] = SE2(pose.x + error[0] + off[0], pose.y + error[1] + off[1], pose.yaw + error[2])
         own = frame.agents["car1"].body
         found = {
-            name: glue.align(
-                boxes["car1"], boxes[name], frame.time, ego_body=own, other_body=frame.agents[name].body
-            )
+            name: glue.align(boxes["car1"], boxes[name], frame.time, ego_body=own, other_body=frame.agents[name].body)
             for name, glue in glues.items()
         }
         report = monitor.update(
@@ -351,8 +350,9 @@ def junction(seed: int, liar: str) -> tuple[set[str], float | None]:
     return faulty, delay
 
 
-def draw(path: Path, measured: list[list[list[Aligned]]]) -> None:
-    """Statistics of three drives over time: a jump, a drift, an honest one."""
+def draw(path: Path) -> None:
+    """Statistics of three drives over time, with alignments of simulated motorways: honest, a jump, a drift."""
+    measured = [[align(scene_sequence("motorway", seed, delay=0.1)) for seed in range(4)]]
     from cobevglue.visualization.style import (
         GIVEN_POSE,
         MATCH,

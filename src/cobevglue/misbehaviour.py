@@ -2,7 +2,8 @@
 
     detector = MisbehaviourDetector()          # one per collaborator
     report = detector.update(ego_boxes, other_boxes, alignment, time)
-    if report.misbehaving: ...                 # leave this agent out, send report.as_dict()
+    if report.misbehaving: ...                 # send report.as_dict()
+    if report.exclude: ...                     # sure: leave this agent out of fusion
 
 Plain view is within `max_range` of the observer and not hidden behind boxes that both sides can check. Every object
 counts once, whatever the number of frames, as what one detector does not see it does not see for long. Of N objects
@@ -63,6 +64,7 @@ class MisbehaviourConfig(Settings):
         contradicted: and are missing if they were missing in this share of the frames.
         memory: objects count until they were out of view so long [s].
         evidence: of misbehaviour from here on: the log-likelihood ratio [nats].
+        exclusion: from here on it is sure, and the agent is to be left out of fusion [nats].
         objects: and at least so many missing objects.
         displaced: an invented object has a removed one within this, and is a displaced one [m].
         repeats: lists sent before, in `history`, that make a replay.
@@ -75,12 +77,13 @@ class MisbehaviourConfig(Settings):
     min_range: _Positive = 4.0
     visible: _Probability = 0.7
     distance: _Positive = 3.0
-    missing_near: _Probability = 0.3
+    missing_near: _Probability = 0.2
     missing_per_m: Annotated[float, Field(ge=0.0, le=0.1)] = 0.01
     frames: Annotated[int, Field(ge=1)] = 5
     contradicted: _Probability = 0.8
     memory: _Positive = 5.0
-    evidence: _Positive = 5.0
+    evidence: _Positive = 5.5
+    exclusion: _Positive = 10.0
     objects: Annotated[int, Field(ge=1)] = 3
     displaced: _Positive = 8.0
     repeats: Annotated[int, Field(ge=1)] = 3
@@ -117,6 +120,7 @@ class MisbehaviourReport:
         observations: what speaks against the agent; none in a report on an agent without misbehaviour.
         invented: evidence for invented objects so far [nats].
         removed: evidence for removed objects so far [nats].
+        exclude: whether the detector is sure: the agent is to be left out of fusion.
         tested: number of the other's objects in the ego's plain view, and of the ego's in the other's.
     """
 
@@ -125,10 +129,11 @@ class MisbehaviourReport:
     invented: float
     removed: float
     tested: tuple[int, int]
+    exclude: bool
 
     @property
     def misbehaving(self) -> bool:
-        """Whether the detector is sure: the agent is to be left out of fusion."""
+        """Whether there is something to report."""
         return bool(self.observations)
 
     def as_dict(self, agent: str) -> dict[str, Any]:
@@ -280,7 +285,8 @@ class MisbehaviourDetector:
                 observations.append(Observation(label, 4, evidence, tuple(sorted(absent)), share))
         if self._repeats >= config.repeats:
             observations.append(Observation("ObjectList-Replayed", 2, np.inf, (), 1.0))
-        return MisbehaviourReport(now, tuple(observations), evidences[0], evidences[1], (tested[0], tested[1]))
+        sure = any(o.evidence >= config.exclusion for o in observations)
+        return MisbehaviourReport(now, tuple(observations), evidences[0], evidences[1], (tested[0], tested[1]), sure)
 
 
 def share_evidence(missing: BoolArray, probability: FloatArray) -> tuple[float, float]:
