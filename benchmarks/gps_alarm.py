@@ -11,8 +11,8 @@
 Alignments are measured ones: BEVGlue on V2V4Real (own frames, own vehicles given; development: train, confirmation:
 val) and on simulated scenes with lists 0.1 s late (development: seeds
 0 to 15, confirmation: 100 to 115). Long drives are put together from them: blocks of up to 5 s, drawn at random with
-half of them from each source, with their errors, covariances and refusals as they were. Where no alignment is usable, nothing
-can be found; "aligned": usable in 8 of the first 10 frames of the attack. Localisation is simulated:
+half of them from each source, with their errors, covariances and refusals as they were. Where no alignment is
+usable, nothing can be found; "aligned": usable in 8 of the first 10 frames of the attack. Localisation is simulated:
 claims are the truth plus a first-order Gauss-Markov process for each agent and component (time constant 60 s). The ego
 drives at 10 m/s. The data is read from $COBEVGLUE_DATA (default ../shared/data).
 """

@@ -2,6 +2,7 @@
 
     python benchmarks/misbehaviour.py                        # on the development data
     python benchmarks/misbehaviour.py --data confirmation    # on the data kept apart
+    python benchmarks/misbehaviour.py --only V2V4Real        # or scenes
     python benchmarks/misbehaviour.py --json results.json
     python benchmarks/misbehaviour.py --picture docs/images/misbehaviour.png   # only the picture of docs/trust.md
 
@@ -46,6 +47,7 @@ def main() -> None:
     """Print the tables and, on request, write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", choices=tuple(SEQUENCES), default="development")
+    parser.add_argument("--only", choices=("V2V4Real", "scenes"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
@@ -54,8 +56,9 @@ def main() -> None:
         return
     print_head(f"{arguments.data} data")
     table: Table = []
-    for source, drives in (("V2V4Real", real_drives(arguments.data)), ("scenes", scene_drives(arguments.data))):
-        for name, tamper in ATTACKS.items():
+    for source, load in (("V2V4Real", real_drives), ("scenes", scene_drives)):
+        drives = load(arguments.data) if arguments.only in (None, source) else []
+        for name, tamper in ATTACKS.items() if drives else ():
             table.append(row(source, name, drives, tamper))
             print("   …", table[-1], file=sys.stderr)
     show(table)

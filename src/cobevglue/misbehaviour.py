@@ -137,8 +137,10 @@ class MisbehaviourReport:
         return bool(self.observations)
 
     def as_dict(self, agent: str) -> dict[str, Any]:
-        """For JSON: observations and evidence under names of TS 103 759. The messages themselves, signed, are to be
-        added by the station as `v2xPduEvidence`."""
+        """For JSON: observations and evidence under names of TS 103 759.
+
+        The messages themselves, signed, are to be added by the station as `v2xPduEvidence`.
+        """
         return {
             "generationTime": self.time,
             "subject": agent,
