@@ -88,7 +88,7 @@ class PairTest:
 
     Attributes:
         offset: (2,) how far the claimed position of the second agent relative to the first is off, by the filter: x and
-            y in the frame of the claims [m].
+            y in the frame of the claims [m]; after a jump, what it was before.
         deviations: the same in standard deviations of the claims.
         jump: the CUSUM of the innovations as a share of its threshold: 1 is an alarm.
         reason: "jump", "offset" or "jump and offset"; "" if the claims are consistent with the alignments.
