@@ -137,18 +137,15 @@ def sources(data: Path, which: str) -> list[list[list[Aligned]]]:
         data / "v2v4real_detections", data / "v2v4real_cars.csv", SEQUENCES[which], bodies=True
     )
     scenes = (scene_sequence(name, seed, delay=0.1) for name in SCENES for seed in SCENE_SEEDS[which])
-    found = []
+    found: list[list[list[Aligned]]] = []
     for sequences in (real, scenes):
         found.append([])
         for sequence in sequences:
             rows = align(sequence)
             if len(rows) > BLOCK:
                 found[-1].append(rows)
-    frames, accepted = (
-        sum(f(row) for source in found for rows in source for row in rows)
-        for f in (lambda row: 1, lambda row: row.alignment.accepted)
-    )
-    print(f"{frames} measured alignments, {100.0 * accepted / frames:.1f} % accepted", file=sys.stderr)
+    accepted = [row.alignment.accepted for source in found for rows in source for row in rows]
+    print(f"{len(accepted)} measured alignments, {100.0 * np.mean(accepted):.1f} % accepted", file=sys.stderr)
     return found
 
 

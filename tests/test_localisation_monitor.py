@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +13,23 @@ from hypothesis import strategies as st
 from cobevglue import SE2
 from cobevglue.alignment import Alignment
 from cobevglue.localisation_monitor import LocalisationMonitor, LocalisationMonitorConfig, LocalisationReport
+from cobevglue.typing import FloatArray
 
 COVARIANCE = np.diag([0.25, 0.25, math.radians(0.5) ** 2])
 TRUE = {"car1": SE2(100.0, 50.0, 0.7), "car2": SE2(120.0, 40.0, 2.0), "car3": SE2(90.0, 80.0, -1.0)}
 
 
 def aligned(pose: SE2, **fields: float) -> Alignment:
-    known = {"risk": 0.001, "evidence": 30.0, "margin": 25.0} | fields
+    known: dict[str, Any] = {"risk": 0.001, "evidence": 30.0, "margin": 25.0} | fields
     return Alignment(pose, covariance=np.diag([0.1, 0.1, 1e-4]), **known)
 
 
 def drive(
-    false: dict[str, SE2], frames: int = 20, names: tuple[str, ...] = ("car1", "car2", "car3"), monitor=None, **fields
+    false: dict[str, SE2],
+    frames: int = 20,
+    names: tuple[str, ...] = ("car1", "car2", "car3"),
+    monitor: LocalisationMonitor | None = None,
+    **fields: float,
 ) -> LocalisationReport:
     """The last report where claims are off, in the world's axes, by `false` from the first frame on."""
     monitor = monitor or LocalisationMonitor()
@@ -106,7 +112,7 @@ def test_one_wrong_alignment_is_no_alarm() -> None:
         ("a different pose has nearly as much evidence", {"margin": 3.0}),
     ],
 )
-def test_uncertain_alignments_are_not_used(why: str, fields: dict[str, float]) -> None:
+def test_uncertain_alignments_are_not_used(why: str, fields: dict[str, Any]) -> None:
     assert drive({"car2": SE2(30.0)}, **fields).pairs == {}, why
 
 
@@ -173,7 +179,7 @@ def test_honest_errors_have_the_stated_size() -> None:
         ("claimed: car2: the covariance must be", "car1", np.eye(2)),
     ],
 )
-def test_bad_input_is_named(message: str, ego: str, covariance) -> None:
+def test_bad_input_is_named(message: str, ego: str, covariance: FloatArray) -> None:
     claimed = {"car1": (TRUE["car1"], COVARIANCE), "car2": (TRUE["car2"], covariance)}
     with pytest.raises(ValueError, match=message):
         LocalisationMonitor().update(0.0, claimed, {}, ego)
@@ -181,4 +187,4 @@ def test_bad_input_is_named(message: str, ego: str, covariance) -> None:
 
 def test_unknown_settings_are_errors() -> None:
     with pytest.raises(ValueError, match="did you mean 'jump_time'"):
-        LocalisationMonitorConfig(jump_tim=1.0)
+        LocalisationMonitorConfig.model_validate({"jump_tim": 1.0})

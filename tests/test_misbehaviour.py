@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from cobevglue import SE2, Boxes
 from cobevglue.alignment import Alignment
 from cobevglue.misbehaviour import MisbehaviourDetector, MisbehaviourReport, share_evidence
 
+_Places = list[tuple[float, float]]
 EGO_SE2_OTHER = SE2(10.0, 5.0, 0.5)
 REAL = [(15.0, 8.0), (20.0, -10.0), (-12.0, 6.0), (5.0, 18.0), (25.0, 15.0), (-8.0, -14.0)]
 NOBODY_SAW = [(12.0, -6.0), (-15.0, -4.0), (8.0, 10.0), (18.0, 2.0), (-6.0, 12.0), (2.0, -15.0), (-10.0, 16.0)]
@@ -23,10 +25,12 @@ def cars(places: list[tuple[float, float]], first_id: int = 0) -> Boxes:
     return Boxes(center, np.tile((4.5, 1.9, 1.6), (n, 1)), np.zeros(n), track_id=first_id + np.arange(n))
 
 
-def watch(seen: Boxes, told: Boxes, frames: int = 12, detector=None, **fields: float) -> MisbehaviourReport:
+def watch(
+    seen: Boxes, told: Boxes, frames: int = 12, detector: MisbehaviourDetector | None = None, **fields: float
+) -> MisbehaviourReport:
     """The last report; `told` is in the ego frame, moves a little in each frame, and is sent in the other's frame."""
     detector = detector or MisbehaviourDetector()
-    known = {"risk": 0.001, "evidence": 30.0, "margin": 25.0} | fields
+    known: dict[str, Any] = {"risk": 0.001, "evidence": 30.0, "margin": 25.0} | fields
     alignment = Alignment(EGO_SE2_OTHER, covariance=np.eye(3) * 0.01, **known)
     for frame in range(frames):
         moved = told.replace(center=told.center + [0.001 * frame, 0.0, 0.0])
@@ -44,7 +48,7 @@ def watch(seen: Boxes, told: Boxes, frames: int = 12, detector=None, **fields: f
         ("objects far away are in nobody's plain view", REAL, REAL[:3] + [(80.0 + 9 * k, 5.0) for k in range(9)], []),
     ],
 )
-def test_lists_in_plain_view(why: str, seen: list, told: list, names: list[str]) -> None:
+def test_lists_in_plain_view(why: str, seen: _Places, told: _Places, names: list[str]) -> None:
     report = watch(cars(seen), cars(told))
     assert [o.name for o in report.observations] == names, why
     assert report.misbehaving is bool(names), why
