@@ -1,15 +1,15 @@
 """A SORT-style multi-object tracker in bird's-eye view, for boxes seen from a vehicle whose own motion is unknown.
 
 After Bewley et al., "Simple Online and Realtime Tracking" (ICIP 2016): a constant-velocity Kalman filter for each track
-and the Hungarian method to associate. Three things differ, because no localisation is at hand and identities are what
-we are after:
+and the Hungarian method for association. Three things differ, since no localisation is available and identities are the
+output:
 
-- The frame moves. A parked car comes towards a vehicle at 20 m/s by 2 m a frame, and in a bend the far ones faster, so
-  the motion that most tracks share is taken for the frame's own: it is fitted to the associations of each frame and
-  predicts all tracks in the next one, new ones included. A track's velocity is what remains: its own.
-- Every detection gets an identity at once. Identities are hints to the object matching, which wants them early and pure
+- Ego-motion is estimated from the tracks. From a vehicle at 20 m/s, a parked car moves by 2 m a frame. The motion that
+  most tracks share is taken for that of the frame: it is fitted to the associations of each frame and predicts all
+  tracks in the next one, also new ones. The velocity of a track is the remainder.
+- Every detection gets an identity at once. The object matching uses identities as hints, and needs them early and pure
   (one identity, one object) rather than long.
-- Headings may be flipped: a detector that mistakes front and back neither breaks a track nor turns it.
+- Headings may be flipped: a heading that is off by 180 degrees neither ends nor rotates a track.
 
 Importing this module imports neither torch nor numba; the first `update` imports numba for the overlap of boxes.
 """
@@ -41,44 +41,44 @@ _NONE = np.zeros(0, dtype=np.int64)
 _SAME_TIME = 1e-6
 """Slack of `max_age` [s]: a clock that counts tenths of seconds counts in no binary fractions."""
 _UNKNOWN = 1.0
-"""Beyond this uncertainty [m] of where the frame has moved to, the motion is looked for and not only refined."""
+"""Uncertainty of the frame's translation above which it is searched for and not only refined [m]."""
 _CELL, _CELLS = 0.5, 10
 """Size of a cell [m] and half the number of them along each side, in that search: motions up to 5 m a frame."""
 _SAME_PLACE = 0.2
-"""Predictions that move by less [m] when the frame's motion is corrected need no other association."""
+"""If the correction of the frame's motion moves all predictions by less, they are not associated again [m]."""
 _ROUNDS = 4
-"""Most rounds of associating and correcting the frame's motion in an update; one is the rule."""
+"""Maximum rounds of association and correction of the frame's motion in an update."""
 _NEW = 0.9
-"""Share of the velocity's prior above which nothing is known of it: the object was seen once."""
+"""A track whose velocity has this share of its prior standard deviation or more has one detection."""
 _ASIDE, _SAME_ROAD, _SAME_LENGTH = 1.2, math.sin(math.radians(15.0)), 1.5
-"""How far beside its course [m], how much turned (sine) and how much longer [m] a fast new object is seen next."""
+"""Maximum offset from the course [m], heading difference (sine) and length difference [m] of a fast new object."""
 _HEADING_GAIN, _SHAPE_GAIN, _FRONT_GAIN = 0.5, 0.3, 0.2
-"""Shares of a new detection in a track's heading, its size and height, and the vote on which end is the front."""
+"""Weights of a new detection in a track's heading, in its size and height, and in the vote on its direction."""
 
 
 class SortConfig(Settings):
-    """Settings of `Sort`. CoBEVGlue's paper gives none: these are ours, chosen on V2V4Real's training sequences.
+    """Settings of `Sort`. CoBEVGlue's paper gives none; these were chosen on V2V4Real's training sequences.
 
     `benchmarks/tracking.py` measures them: without `frame_motion` an object changes its identity twice as often, more
     in a bend; a shorter `max_age` makes identities shorter and no purer; `giou` is a little better than `distance` on
     KITTI and V2V4Real.
 
     Attributes:
-        affinity: what associates a detection with a predicted track: `giou`, the overlap of their boxes and how near
-            they are where there is none, or `distance`, of their centres.
-        max_distance: a detection further from the predicted centre is another object [m].
-        min_giou: a detection with a smaller generalised IoU is another object (with `giou`).
-        max_age: how long a track may go unseen, and how long a gap in the input may be, before it ends [s].
-        period: time between updates that come without a time [s].
+        affinity: of a detection and a predicted track: `giou`, the generalised IoU of their boxes, or `distance`, of
+            their centres.
+        max_distance: maximum distance of a detection from the predicted centre [m].
+        min_giou: minimum generalised IoU of a detection and the predicted box (with `giou`).
+        max_age: maximum time without a detection, and maximum gap in the input, before a track ends [s].
+        period: time between updates without a time [s].
         position_noise: standard deviation of a detected centre on each axis [m].
         acceleration_noise: standard deviation of an object's acceleration on each axis [m/s^2].
         velocity_prior: standard deviation of a new object's own velocity on each axis [m/s].
         max_speed: the fastest objects relative to the frame [m/s].
-        frame_motion: estimate the frame's own motion; switch it off where the frame is known to stand still.
+        frame_motion: estimate the frame's motion; False for a frame that is known not to move.
         frame_speed_prior: standard deviation of the frame's velocity on each axis at the start [m/s].
         frame_turn_prior: standard deviation of the frame's turn rate at the start [rad/s].
-        frame_acceleration_noise: how fast the frame's velocity may change [m/s^2].
-        frame_turn_noise: how fast the frame's turn rate may change [rad/s^2].
+        frame_acceleration_noise: standard deviation of the frame's acceleration on each axis [m/s^2].
+        frame_turn_noise: standard deviation of the frame's angular acceleration [rad/s^2].
 
     Raises:
         ValueError: a value out of range or an unknown field; names the field.
@@ -102,12 +102,12 @@ class SortConfig(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """What a tracker believes of its N living tracks, also of those it has not seen just now.
+    """The state of N active tracks, including those without a detection in the last update.
 
     Attributes:
         boxes: N boxes in the agent's frame: filtered centre and heading, smoothed size, `track_id`.
-        velocity: (N, 2) velocity along the frame's axes [m/s], over ground as far as the frame's motion was told right:
-            where all objects move alike, theirs is taken for the frame's.
+        velocity: (N, 2) velocity over ground along the frame's axes [m/s]. Where all objects move alike, their motion
+            is taken for the frame's.
         unseen: (N,) time since the last detection [s].
     """
 
@@ -117,13 +117,13 @@ class Tracks:
 
 
 class Sort:
-    """Gives the boxes of successive frames identities that last. One tracker per agent.
+    """Assigns track ids to the boxes of successive frames. One tracker per agent.
 
         tracker = Sort()
         for boxes in frames:
             tracked = tracker.update(boxes)  # the same boxes, with track_id
 
-    The same input gives the same identities, and none is given twice in a tracker's life, not even after `reset`.
+    The same input gives the same ids. An id is never assigned to a second track, not even after `reset`.
 
     Args:
         config: settings; the defaults are for vehicles at 10 Hz.
@@ -135,20 +135,19 @@ class Sort:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks, the frame's motion and the time. Identities go on counting."""
+        """Delete all tracks, the frame's motion and the time. Ids continue to increase."""
         self._clock = Clock(self.config.period)
         self._tracks = _State()
         self._frame = _FrameMotion(self.config)
 
     def update(self, boxes: Boxes, time: float | None = None, heading_confidence: FloatArray | None = None) -> Boxes:
-        """Identities for the boxes of the next frame.
+        """Assign track ids to the boxes of the next frame.
 
-        The boxes come back as they are, every one and in the same order: detections, not filtered states. What the
-        filter makes of them is in `tracks`.
+        All boxes are returned unchanged and in the same order: detections, not filtered states, which `tracks` has.
 
         Args:
-            boxes: N detections in the agent's frame; scores, labels and any `track_id` play no part.
-            time: when they were seen [s], on any clock; by default `config.period` after the last update. After a gap
+            boxes: N detections in the agent's frame; scores, labels and any `track_id` are not used.
+            time: of the detections [s], on any clock; by default `config.period` after the last update. After a gap
                 longer than `config.max_age` all tracks are new.
             heading_confidence: (N,) in [0, 1] of the direction of each heading (front or back); 1 for all if None.
 
@@ -193,7 +192,7 @@ class Sort:
 
     @property
     def tracks(self) -> Tracks:
-        """The living tracks as filtered up to the last update."""
+        """The active tracks, filtered up to the last update."""
         s = self._tracks
         center = np.column_stack([s.position.real, s.position.imag, s.shape[:, 3]])
         boxes = Boxes(center, s.shape[:, :3], wrap_angle(s.yaw), track_id=s.id)
@@ -201,7 +200,7 @@ class Sort:
 
     @property
     def now_SE2_before(self) -> SE2:
-        """The frame's own motion over the last step: where a point at rest, given as seen before, is seen now."""
+        """Motion of the frame over the last step: maps points at rest from the previous frame to the current one."""
         return SE2(self._frame.shift.real, self._frame.shift.imag, self._frame.yaw)
 
     @property
@@ -210,13 +209,13 @@ class Sort:
         return self._clock.time or 0.0
 
     def _end_lost_tracks(self, time: float) -> None:
-        """Death: unseen for too long."""
+        """Delete tracks without a detection for longer than `max_age`."""
         alive = time - self._tracks.seen <= self.config.max_age + _SAME_TIME
         if not alive.all():
             self._tracks.keep(alive)
 
     def _predict(self, dt: float) -> None:
-        """Each object goes on at its own velocity, by random accelerations more or less."""
+        """Prediction step of the Kalman filters: constant velocity with random accelerations."""
         s, q = self._tracks, self.config.acceleration_noise**2
         s.position = s.position + dt * s.velocity
         position, mixed, velocity = s.variance
@@ -229,10 +228,10 @@ class Sort:
         )
 
     def _associate(self, boxes: Boxes, dt: float) -> tuple[IntArray, IntArray]:
-        """Rows of tracks and rows of boxes that belong together; leaves the tracks in the frame of now.
+        """Associated rows of tracks and of boxes; transforms the tracks to the current frame.
 
-        The frame is first taken to go on moving as it did. The associations that this gives tell how it did move, and
-        where that changes the prediction, they are made once more.
+        The motion of the frame is predicted first, then corrected by the associations. If that changes the predictions,
+        boxes are associated again.
         """
         s, frame, detected = self._tracks, self._frame, _plane(boxes)
         frame.predict(dt)
@@ -272,9 +271,9 @@ class Sort:
         return new[found], left[taken]
 
     def _assign(self, at: _ComplexArray, boxes: Boxes) -> tuple[IntArray, IntArray]:
-        """The cheapest one-to-one assignment of tracks, predicted `at` (N,), to boxes, within the gate.
+        """The one-to-one assignment of tracks, predicted `at` (N,), to boxes with the least cost, within the gate.
 
-        No pair costs more than the gate: a good pair is never given up so that a bad one fits in as well.
+        Costs are capped at the gate, so that a good pair is never given up for a further pair outside the gate.
         """
         if self.config.affinity == "giou":
             from cobevglue._iou_kernels import giou_matrix
@@ -290,7 +289,7 @@ class Sort:
         return _assign_within(cost, gate)
 
     def _correct(self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float, votes: FloatArray) -> None:
-        """The Kalman update of the associated tracks; heading and shape by a share of what is new in the detection."""
+        """Update the associated tracks: a Kalman filter for the motion, moving averages for heading and shape."""
         s = self._tracks
         position, mixed, velocity = s.variance[:, rows]
         gain = position / (position + self.config.position_noise**2)
@@ -314,7 +313,7 @@ class Sort:
     def _begin_new_tracks(
         self, rows: IntArray, boxes: Boxes, columns: IntArray, time: float, votes: FloatArray
     ) -> IntArray:
-        """Birth: a new identity for each box that continues no track. Returns the identities of all boxes (N,)."""
+        """Begin a track for each box that was not associated, and return the ids of all boxes (N,)."""
         ids = np.full(len(boxes), -1, dtype=np.int64)
         ids[columns] = self._tracks.id[rows]
         new = np.flatnonzero(ids < 0)
@@ -335,7 +334,7 @@ def _assign_within(cost: FloatArray, gate: float) -> tuple[IntArray, IntArray]:
 
 
 class _FrameMotion:
-    """How a frame without localisation moves, told from what most things in it do: a Kalman filter on its twist.
+    """Motion of the frame, estimated from the motion that most tracks share: a Kalman filter on its twist.
 
     Attributes:
         shift: translation of now_SE2_before, where a point at rest seen before is seen now, as x + iy [m].
@@ -351,7 +350,7 @@ class _FrameMotion:
         self._expected, self._prior, self._dt = np.zeros(3), np.eye(3), config.period
 
     def predict(self, dt: float) -> None:
-        """The frame goes on as it did, by random accelerations more or less."""
+        """Prediction step: constant twist with random accelerations."""
         if self._moves:
             self._covariance = 0.5 * (self._covariance + self._covariance.T) + dt**2 * self._noise
             self._expected, self._prior, self._dt = dt * self._twist, dt**2 * self._covariance, dt
@@ -363,10 +362,10 @@ class _FrameMotion:
         return float(self._dt * math.sqrt(self._covariance[0, 0]))
 
     def acquire(self, before: _ComplexArray, now: _ComplexArray) -> None:
-        """Look for the translation that most pairs of a point `before` and one `now` have in common.
+        """Search for the translation that most pairs of a point `before` and one `now` share.
 
-        In a row of cars the nearest is often the neighbour. All pairs vote in a grid, and the densest 3 x 3 cells win,
-        the ones nearest to the expected motion if there are several.
+        In a row of cars the nearest point is often that of the neighbour. All pairs vote in a grid; the 3 x 3 cells
+        with the most votes are chosen, the nearest to the expected motion among equals.
         """
         offset = (now[None, :] - self.apply(before)[:, None]).ravel()
         cell = np.rint(np.column_stack([offset.real, offset.imag]) / _CELL).astype(np.int64)
@@ -384,10 +383,10 @@ class _FrameMotion:
         self._set(self._motion + [shift.real, shift.imag, 0.0])
 
     def correct(self, before: _ComplexArray, now: _ComplexArray, variance: FloatArray) -> None:
-        """Fit the motion to points predicted `before`, in the frame of then, and seen `now`; all (N,).
+        """Fit the motion to points predicted `before`, in the previous frame, and detected `now`; all (N,).
 
-        One step of Gauss-Newton from the best motion so far, with each point's weight lowered by its own error
-        (Cauchy's loss), so that what moves otherwise or is associated wrongly does not pull.
+        One Gauss-Newton step from the current estimate with Cauchy weights, so that moving objects and wrong
+        associations have little influence.
         """
         turned = self.turn(before)
         error = now - turned - self.shift
@@ -403,11 +402,11 @@ class _FrameMotion:
         self._twist, self._covariance = self._motion / self._dt, remaining @ self._prior / self._dt**2
 
     def apply(self, points: _ComplexArray) -> _ComplexArray:
-        """Points at rest (N,), as seen before, as they are seen now."""
+        """Transform points at rest (N,) from the previous frame to the current one."""
         return self.turn(points) + self.shift
 
     def turn(self, vectors: _ComplexArray) -> _ComplexArray:
-        """Vectors (N,) along the axes of before, along those of now."""
+        """Rotate vectors (N,) from the axes of the previous frame to those of the current one."""
         turned: _ComplexArray = vectors * cmath.rect(1.0, self.yaw)
         return turned
 
@@ -444,7 +443,7 @@ class _State:
     def append(
         self, ids: IntArray, boxes: Boxes, rows: IntArray, time: float, votes: FloatArray, config: SortConfig
     ) -> None:
-        """Add tracks of these rows of `boxes`, at rest as far as one can tell."""
+        """Add tracks of these rows of `boxes`, with velocity 0."""
         n = len(rows)
         prior = np.array([config.position_noise**2, 0.0, config.velocity_prior**2])
         self.id = np.concatenate([self.id, ids])

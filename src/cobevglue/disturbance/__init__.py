@@ -1,4 +1,4 @@
-"""What goes wrong on the road, seeded per sample: detection errors, localisation noise and attack, latency, loss."""
+"""Disturbances, seeded per sample: detection errors, localisation noise and attacks, late and lost messages."""
 
 from __future__ import annotations
 

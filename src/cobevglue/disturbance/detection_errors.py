@@ -1,4 +1,4 @@
-"""Turns true boxes into what a LiDAR detector would output: displaced, missed, flipped, and some that are not there."""
+"""A model of the errors of a LiDAR detector: displaced, missed, flipped and false boxes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 _Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 _FALSE_SIZE = (4.5, 1.9, 1.6)
-"""Length, width, height of a typical false box [m]: a detector of vehicles hallucinates mostly cars."""
+"""Length, width, height of a false box [m]: that of a car."""
 _TRUE_SCORE, _TRUE_SCORE_LOST_PER_M, _FALSE_SCORE = 0.9, 0.004, 0.35
 """Mean scores: a true box close by, what it loses with range, and a false box at any range."""
 _SMALLEST_SIZE_FACTOR = 0.5
@@ -27,7 +27,7 @@ _SMALLEST_SIZE_FACTOR = 0.5
 
 
 class DetectionErrors(Settings):
-    """How far a detector's boxes are from the truth. The defaults resemble a PointPillars detector on cars.
+    """Parameters of detection errors. The defaults resemble a PointPillars detector on cars.
 
     Attributes:
         center_std: standard deviation of the centre's x and of its y, at the agent's origin [m].

@@ -1,4 +1,4 @@
-"""What every disturbance looks like from outside: it changes what an ego hears in one frame of a drive."""
+"""The interface of disturbances, which change what an ego receives in one frame of a sequence."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Undisturbed(Disturbance):
 
 
 def agent_rng(key: Sequence[int], stream: int, index: int, agent: str) -> np.random.Generator:
-    """Random numbers of one agent in one frame, whichever others are there."""
+    """Random numbers of one agent in one frame, independent of the other agents."""
     return np.random.default_rng([*key, stream, index, zlib.crc32(agent.encode())])
 
 

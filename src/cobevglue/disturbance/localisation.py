@@ -1,4 +1,4 @@
-"""Localisation that is noisy, attacked, old or off: agents claim to be where they are not."""
+"""Disturbances of localisation: noise, the same-place attack, replayed and constantly offset poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 class LocalisationNoise(Disturbance):
     """Gaussian noise on the pose of every agent, the ego's included, anew in every frame (paper, section 6.2).
 
-    The same key gives the same noise at every level, but for its size: levels can be compared draw by draw.
+    With the same key, noise of different standard deviations has the same draws, scaled.
 
     Attributes:
         position: standard deviation of x and of y [m].
@@ -34,7 +34,7 @@ class LocalisationNoise(Disturbance):
     yaw: _Spread = 0.5
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Everyone claims a pose next to its own."""
+        """Add noise to the claimed pose of every agent."""
         now = frames[index]
         claimed = {}
         for agent, world_SE3_lidar in now.claimed.items():
@@ -46,25 +46,25 @@ class LocalisationNoise(Disturbance):
 
 
 class SamePlace(Disturbance):
-    """The attack of the paper: spoofed satellites make all collaborators believe they are where the ego is."""
+    """The attack of the paper: spoofed GNSS, with which all collaborators claim the pose of the ego."""
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Everyone claims the ego's pose."""
+        """Replace all claimed poses by the ego's."""
         now = frames[index]
         return replace(now, claimed=dict.fromkeys(now.claimed, now.claimed[ego]))
 
 
 class ReplayedPose(Disturbance):
-    """Spoofed satellites play back an old recording: collaborators claim the pose of some time ago.
+    """Replayed GNSS: collaborators claim an earlier pose of their own.
 
     Attributes:
-        seconds: how old it is [s]; in the first frames of a drive, the first pose there is.
+        seconds: its age [s]. In the first frames of a sequence it is the first pose.
     """
 
     seconds: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 1.0
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Collaborators claim their old pose."""
+        """Replace the claimed poses of collaborators by earlier ones."""
         now = frames[index]
         claimed = dict(now.claimed)
         for agent in now.collaborators(ego):
@@ -75,12 +75,12 @@ class ReplayedPose(Disturbance):
 
 
 class OffsetPose(Disturbance):
-    """Collaborators are always off by the same, such as by a sensor that was never calibrated.
+    """A constant error of the collaborators' poses in their own frames, as of an uncalibrated sensor.
 
     Attributes:
-        x: how much farther ahead of itself a collaborator believes to be [m].
-        y: how much farther to its left [m].
-        yaw: how much farther turned to its left [degrees].
+        x: error forwards [m].
+        y: error to the left [m].
+        yaw: error of the heading, counter-clockwise [degrees].
     """
 
     x: _Finite = 3.0
@@ -88,16 +88,16 @@ class OffsetPose(Disturbance):
     yaw: _Finite = 3.0
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Collaborators claim a pose beside their own."""
+        """Add the error to the claimed poses of collaborators."""
         now = frames[index]
-        lidar_SE3_believed = _turned(math.radians(self.yaw))
-        lidar_SE3_believed[:2, 3] = self.x, self.y
-        claimed = {agent: pose if agent == ego else pose @ lidar_SE3_believed for agent, pose in now.claimed.items()}
+        lidar_SE3_claimed = _turned(math.radians(self.yaw))
+        lidar_SE3_claimed[:2, 3] = self.x, self.y
+        claimed = {agent: pose if agent == ego else pose @ lidar_SE3_claimed for agent, pose in now.claimed.items()}
         return replace(now, claimed=claimed)
 
 
 def _turned(yaw: float) -> FloatArray:
-    """(4, 4) turn about z."""
+    """(4, 4) rotation about z."""
     turn = np.eye(4)
     turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
     return turn

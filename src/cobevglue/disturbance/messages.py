@@ -1,4 +1,4 @@
-"""Messages that are made up, lost or late."""
+"""Disturbances of messages: fabricated boxes, loss and delay."""
 
 from __future__ import annotations
 
@@ -23,27 +23,28 @@ _FABRICATED_STREAM, _LOSS_STREAM = 71, 72
 _CAR = (4.5, 1.9, 1.6)
 """Length, width, height of a fabricated car [m]."""
 _GROUND = -1.0
-"""Height of its centre where a collaborator has no other box to go by [m]."""
+"""Height of its centre if the collaborator has no other box [m]."""
 _SCORE = 0.9
 _VARIANCE = (0.01, 0.01, 0.001)
-"""Of x, y [m^2] and yaw [rad^2]: whoever makes up a box is sure of it."""
+"""Of a fabricated box: variance of x, y [m^2] and yaw [rad^2]."""
 
 
 class FabricatedBoxes(Disturbance):
-    """Every collaborator tells of cars that are not there; they stay with it, so that trackers believe in them, too.
+    """Every collaborator transmits boxes of cars that do not exist.
 
-    They are added to its boxes and detections, not to its points and features.
+    They keep their places in its frame and their track ids, so that they are consistent over time. They are added to
+    its boxes and detections, not to its points and features.
 
     Attributes:
-        count: how many.
-        reach: they are evenly spread around the collaborator as far as this [m].
+        count: number of boxes.
+        reach: radius of the disc around the collaborator in which they are uniformly distributed [m].
     """
 
     count: Annotated[int, Field(ge=0, le=1000)] = 10
     reach: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 40.0
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Collaborators tell more than they saw."""
+        """Add the boxes to the observations of collaborators."""
         now = frames[index]
         seen = dict(now.observations)
         for agent in now.collaborators(ego):
@@ -73,16 +74,16 @@ class FabricatedBoxes(Disturbance):
 
 
 class MessageLoss(Disturbance):
-    """Now and then nothing of a collaborator arrives.
+    """Messages are lost, independently of each other.
 
     Attributes:
-        probability: that this happens to one collaborator in one frame.
+        probability: of the loss of one collaborator's messages of one frame.
     """
 
     probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Some collaborators are missing."""
+        """Remove the collaborators whose messages are lost."""
         now = frames[index]
         for agent in now.collaborators(ego):
             if agent_rng(key, _LOSS_STREAM, index, agent).random() < self.probability:
@@ -91,18 +92,18 @@ class MessageLoss(Disturbance):
 
 
 class Delay(Disturbance):
-    """What collaborators tell arrives late: it is what they saw some time ago, and where they were then.
+    """Messages are late: observations and poses of collaborators are of an earlier frame.
 
-    Before the first message arrives, and where a collaborator was not there at that time, there is nothing of it.
+    A collaborator without an observation in that frame, or before the first message arrives, is removed.
 
     Attributes:
-        seconds: how late [s].
+        seconds: the delay [s].
     """
 
     seconds: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
 
     def apply(self, frames: Sequence[ObservedFrame], index: int, ego: str, key: Sequence[int]) -> ObservedFrame:
-        """Collaborators as they were."""
+        """Replace the observations and poses of collaborators by earlier ones."""
         now = frames[index]
         sent = [frame for frame in frames[: index + 1] if frame.time <= now.time - self.seconds + 1e-6]
         then = sent[-1] if sent else None
