@@ -245,7 +245,7 @@ class DemoResult:
 
 
 def run_demo(seed: int = 0, *, frames: int = FRAMES, progress: Callable[[int], None] | None = None) -> DemoResult:
-    """Simulate the drive and put together, frame by frame, what the agents see.
+    """Simulate the sequence, and fuse the agents' observations frame by frame.
 
     The ego is the agent from which, in the middle of the drive, most vehicles are hidden that drive near it.
 
@@ -311,7 +311,7 @@ def _put_together(
     systems: Mapping[str, CoBEVGlue],
     workers: Executor,
 ) -> DemoFrame:
-    """Perceive, and put together what was perceived in every row's way; `true` are the poses world_SE3_lidar."""
+    """Perceive, and fuse by the method of every row; `true` are the poses world_SE3_lidar."""
 
     def perceive(name: str) -> PerceptionOutput:
         return systems[COBEVGLUE].perceive(name, scene.points[name], scene.time)

@@ -1,4 +1,4 @@
-"""Collaboration by object lists: the poses of other agents, and everyone's objects in the ego frame.
+"""Collaboration by object lists: the poses of other agents, and all agents' objects in the ego frame.
 
     collaboration = ObjectCollaboration()
     seen = collaboration.step({"car1": boxes1, "car2": boxes2}, ego="car1", time=0.0)

@@ -1,4 +1,4 @@
-"""Putting together what several agents saw: one file for each method of the paper's tables."""
+"""Fusion methods: one file for each method of the paper's tables."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class EarlyTeacher(MultiScaleFusion):
         return [torch.stack(scale) for scale in zip(*features, strict=True)]
 
     def fuse_maps(self, maps: Sequence[Tensor], covered: Sequence[Tensor]) -> list[Tensor]:
-        """The ego's own: there is nothing to put together where all points are known."""
+        """The ego's own map: the merged cloud needs no fusion."""
         return [m[0] for m in maps]
 
     @torch.no_grad()

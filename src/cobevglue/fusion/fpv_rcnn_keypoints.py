@@ -1,4 +1,4 @@
-"""What an agent tells of a proposal in FPV-RCNN: some of the points in it, evenly spread."""
+"""Keypoints of a proposal in FPV-RCNN: evenly spread points in it, which an agent transmits."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def read_object_list(path: str | Path) -> Boxes:
         path: a JSON file, UTF-8.
 
     Returns:
-        Boxes in the frame of whoever wrote the file.
+        Boxes in the frame of the agent that wrote the file.
 
     Raises:
         ValueError: one line that names the file, and the row and field where the content is wrong.
@@ -113,7 +113,7 @@ def from_dict(document: Any, source: str = "object list") -> Boxes:
         source: how error messages name the document; a file name for example.
 
     Returns:
-        Boxes in the frame of whoever made the list.
+        Boxes in the frame of the agent that made the list.
 
     Raises:
         ValueError: one line that names `source`, and the row and field where the content is wrong.

@@ -73,7 +73,7 @@ def draw_object_graph(
     filled: bool = True,
     label: str | None = None,
 ) -> None:
-    """Draw an object graph: a node for each object, edges between them, and the common subgraph set off.
+    """Draw an object graph: a node for each object, edges between them, and the common subgraph highlighted.
 
     Any two nodes have an edge; where that would be too many to see anything, only those between near nodes are drawn.
 
@@ -99,7 +99,7 @@ def draw_object_graph(
 
 
 def draw_agent(axes: Axes, color: str, *, x: float = 0.0, y: float = 0.0, yaw: float = 0.0, label: str = "") -> None:
-    """Draw where an agent stands and which way it looks, as an arrow head.
+    """Draw the pose of an agent as an arrow head.
 
     Args:
         axes: the plot.
@@ -114,7 +114,7 @@ def draw_agent(axes: Axes, color: str, *, x: float = 0.0, y: float = 0.0, yaw: f
 
 
 def draw_pairs(axes: Axes, ego: Boxes, moved: Boxes, label: str = "seen by both") -> None:
-    """Draw a ring around each pair of boxes that are one object, and a line between their centres.
+    """Draw a ring around each pair of matched boxes, and a line between their centres.
 
     Args:
         axes: the plot, in the ego's frame.
@@ -143,7 +143,7 @@ def _edges(at: FloatArray) -> FloatArray:
 
 
 def _draw_names(axes: Axes, at: FloatArray, names: Sequence[str]) -> None:
-    """Green discs with names in them, each beside its point on the side away from the others."""
+    """Draw numbered green discs, each beside its point on the side away from the others."""
     outward = at - at.mean(axis=0) if len(at) else at
     outward = outward / np.maximum(np.hypot(outward[:, 0], outward[:, 1]), 1e-9)[:, None]
     for name, point, direction in zip(names, at, outward, strict=True):

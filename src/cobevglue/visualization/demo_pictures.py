@@ -1,4 +1,4 @@
-"""The pictures of the demonstration: one moment as each row has it, and how two cars found each other."""
+"""The pictures of the demo: one frame by each method, and the matched objects of two cars."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _CELL = 0.4  # of the others, one in each square of this side is drawn [m]
 def draw_comparison(
     result: DemoResult, rows: Sequence[str] = (EGO_ONLY, "noisy_gps", "attacked_gps", COBEVGLUE)
 ) -> Figure:
-    """The story's moment as several rows have it, two plots in a line.
+    """The key frame by several methods, two plots in a row.
 
     Args:
         result: the drive.
@@ -51,7 +51,7 @@ def draw_comparison(
 
 
 def draw_moment(axes: Axes, frame: DemoFrame, row: str, roads: RoadNetwork) -> None:
-    """What is there, what was found, and what was made up, in the ego's frame.
+    """Ground truth, true and false detections in the ego frame.
 
     Args:
         axes: an empty plot.
@@ -85,7 +85,7 @@ def draw_moment(axes: Axes, frame: DemoFrame, row: str, roads: RoadNetwork) -> N
 
 
 def draw_pose(result: DemoResult) -> Figure:
-    """How the ego found another car in the story's moment: both object graphs, and what they have in common."""
+    """The alignment of another car in the key frame: both object graphs and their common subgraph."""
     frame, name = result.story(), witness(result)
     alignment = frame.outputs[COBEVGLUE].alignments[name]
     ego, other = frame.tracked[frame.ego], frame.tracked[name]
@@ -93,7 +93,7 @@ def draw_pose(result: DemoResult) -> Figure:
 
 
 def witness(result: DemoResult) -> str:
-    """The agent nearest to what is hidden in the story's moment: whose help matters most."""
+    """The agent nearest to the objects that are hidden from the ego in the key frame."""
     frame = result.story()
     movers = frame.hidden_movers
     at = frame.truth.center[movers[0], :2] if len(movers) else np.zeros(2)
@@ -101,7 +101,7 @@ def witness(result: DemoResult) -> str:
 
 
 def lane_polygon(lane: Lane) -> FloatArray:
-    """(2 N, 2) outline of a lane with N points, in the world's frame."""
+    """(2 N, 2) outline of a lane with N points in the world frame."""
     along = np.gradient(lane.centerline, axis=0)
     along /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
     left = lane.width / 2.0 * np.column_stack([-along[:, 1], along[:, 0]])
@@ -109,7 +109,7 @@ def lane_polygon(lane: Lane) -> FloatArray:
 
 
 def thinned(points: Float32Array) -> Float32Array:
-    """(M, 2) x and y of points above the ground, one for each small square that has any."""
+    """(M, 2) x and y of points above the ground, at most one in each cell of a fine grid."""
     above = points[points[:, 2] > _GROUND, :2]
     _, first = np.unique(np.floor(above / _CELL), axis=0, return_index=True)
     return above[np.sort(first)]
@@ -123,7 +123,7 @@ def _draw_roads(axes: Axes, roads: RoadNetwork, frame: DemoFrame) -> None:
 
 
 def _draw_clouds(axes: Axes, frame: DemoFrame, row: str) -> None:
-    """The ego's points, and those of the others where the ego has them."""
+    """The ego's points, and those of the others transformed by the ego's estimate of their poses."""
     clouds = [(frame.ego, SE2(), EGO), *((name, pose, OTHER) for name, pose in frame.used_poses(row).items())]
     for name, ego_SE2_agent, color in reversed(clouds):
         x, y = ego_SE2_agent.apply(thinned(frame.points[name])).T

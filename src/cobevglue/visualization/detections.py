@@ -1,4 +1,4 @@
-"""What a detector found in a cloud, and what it missed."""
+"""Detections in a cloud: true positives, false positives and missed objects."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["draw_detections", "draw_points"]
 _WIDTH = 16.0  # of the picture [inches]
 _POINTS_AT_MOST = 120_000
 _FLOOR, _CEILING = -2.5, 1.5
-"""Heights over the LiDAR between which points go from light to dark [m]."""
+"""Range of heights above the LiDAR for the grey values of points, from light to dark [m]."""
 
 
 def draw_detections(
@@ -43,7 +43,7 @@ def draw_detections(
     min_points: int = 0,
     title: str = "",
 ) -> Figure:
-    """Draw a cloud from above with the true boxes and the detections, told apart by whether they found each other.
+    """Draw a cloud from above with ground-truth boxes and detections, coloured by whether they are matched.
 
     A line from a box's centre to its front shows its heading; numbers are scores. What counts and what matches is as
     in `cobevglue.evaluation.detection_matching`; ignored objects are dotted.
@@ -87,7 +87,7 @@ def draw_detections(
 
 
 def draw_points(axes: Axes, points: Float32Array) -> None:
-    """Draw a cloud from above as dots, the darker the higher; of very many points, evenly some.
+    """Draw a cloud from above as dots that are darker the higher they are; large clouds are subsampled.
 
     Args:
         axes: the plot, in the frame of the points.
@@ -108,7 +108,7 @@ def draw_points(axes: Axes, points: Float32Array) -> None:
 
 
 def _draw_scores(axes: Axes, boxes: Boxes, color: str) -> None:
-    """Scores without the leading zero, beside the boxes' left-most corners in the picture, where they fit in it."""
+    """Write scores without the leading zero beside the left-most corners of boxes, where they fit into the picture."""
     corners = boxes.bev_corners()
     for row, score in enumerate(boxes.score if boxes.score is not None else ()):
         x, y = corners[row, corners[row, :, 1].argmax()]
@@ -119,7 +119,7 @@ def _draw_scores(axes: Axes, boxes: Boxes, color: str) -> None:
 
 
 def _extent(points: Float32Array, frame: DetectionFrame) -> EvaluationRange:
-    """What holds the boxes, the agent and nearly all points [m]."""
+    """The extent of the boxes, the agent and nearly all points [m]."""
     near = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else np.zeros((2, 2))
     places = np.concatenate([near, frame.truth.center[:, :2], frame.detections.center[:, :2], np.zeros((1, 2))])
     (x_min, y_min), (x_max, y_max) = places.min(axis=0) - 5.0, places.max(axis=0) + 5.0

@@ -1,4 +1,4 @@
-"""Building blocks of report pages: one HTML file each, everything inside, nothing loaded from anywhere.
+"""Building blocks of report pages: self-contained HTML files that load nothing from other places.
 
 Text given to any of these is plain text; what they return is HTML.
 """
@@ -62,7 +62,7 @@ _LONG_CELL = 36
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of a page.
+    """A section of a page.
 
     Attributes:
         heading: of the part, plain text.

@@ -1,4 +1,4 @@
-"""The figures of a study: quality against localisation noise and against communication, and what methods saw.
+"""The figures of a study: average precision over localisation noise and over communication, and detections.
 
 All are returned as the bytes of PNG files.
 """
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 __all__ = ["ap_over_bytes", "ap_over_noise", "detections_picture", "matching_picture"]
 
 _COLORS = ("#0072B2", "#D55E00", "#AA4499", "#E69F00", "#56B4E9", "#882255", "#999933", "#332288", "#CC79A7", "#A05A2C")
-"""Of what has no colour of its own; with the markers, seventy can be told apart. Green is CoBEVGlue's."""
+"""Colours of lines without a colour of their own; with the markers, seventy combinations. Green is CoBEVGlue's."""
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _DETECTION = "#C8102E"
 _TRUE_BOX = "#1A8A4A"
-"""Green and red, as in the paper; true boxes are filled, detections are outlines."""
+"""Green and red, as in the paper; ground-truth boxes are filled, detections are outlines."""
 _EGO_ONLY = ("ego only", "no collaboration", "none")
 
 
@@ -109,7 +109,7 @@ def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str, base: 
 
 
 def detections_picture(clouds: Sequence[FloatArray], truth: Boxes, boxes: Boxes, title: str) -> bytes:
-    """All agents' points seen from above with the true boxes (green) and the detected ones (red), as in the paper.
+    """All agents' points from above with ground-truth boxes (green) and detections (red), as in the paper.
 
     Args:
         clouds: of each agent, (N_i, 3 or more) x, y, z [m], all in the ego's frame.
@@ -129,7 +129,7 @@ def detections_picture(clouds: Sequence[FloatArray], truth: Boxes, boxes: Boxes,
 
 
 def matching_picture(ego: Boxes, other: Boxes, alignment: Alignment) -> bytes:
-    """What two agents detected, in the ego's frame by the pose that was found, matched objects joined.
+    """The detections of two agents in the ego frame by the estimated pose, with lines between matched objects.
 
     Args:
         ego: M boxes in the ego's frame.
@@ -144,7 +144,7 @@ def matching_picture(ego: Boxes, other: Boxes, alignment: Alignment) -> bytes:
 
 
 def _map(shown: Sequence[Boxes]) -> tuple[Figure, Axes]:
-    """A figure with one plot that holds all these boxes and the ego."""
+    """A figure with one plot whose limits contain all boxes and the ego."""
     corners = np.concatenate([np.zeros((1, 2)), *(boxes.bev_corners().reshape(-1, 2) for boxes in shown)])
     (x_min, y_min), (x_max, y_max) = corners.min(axis=0) - 5.0, corners.max(axis=0) + 5.0
     figure = new_figure(
@@ -157,7 +157,7 @@ def _map(shown: Sequence[Boxes]) -> tuple[Figure, Axes]:
 
 
 def _styles(names: Sequence[str]) -> list[dict[str, Any]]:
-    """How the line of each method is drawn."""
+    """The line style of each method."""
     styles: list[dict[str, Any]] = []
     drawn = 0
     for name in names:
@@ -179,7 +179,7 @@ def _family(label: str) -> str:
 
 
 def _finish(figure: Figure, axes: Axes, title: str, order: Sequence[str] | None = None) -> None:
-    """Title, grid, and the legend beside the plot, in this order of names."""
+    """Set title and grid, and the legend beside the plot in this order of names."""
     set_title(axes, title)
     axes.set_ylabel("average precision")
     light_grid(axes)

@@ -1,4 +1,4 @@
-"""Colours, figures and files: what all pictures share.
+"""Colours, figures and files that all pictures share.
 
 Figures are made with matplotlib's objects, without pyplot: nothing is global, and no display is needed. The colours
 are from the palette of Okabe and Ito, which people with any kind of colour vision can tell apart; whose a box is can be
@@ -38,15 +38,15 @@ __all__ = [
 ]
 
 EGO = "#0072B2"
-"""Blue: the ego and what it saw."""
+"""Blue: the ego and its detections."""
 OTHER = "#D55E00"
-"""Orange: the other agent and what it saw."""
+"""Orange: the other agent and its detections."""
 MATCH = "#009E73"
-"""Green: objects that both saw, and what BEVGlue makes of them."""
+"""Green: co-visible objects, and results of BEVGlue."""
 GIVEN_POSE = "#AA4499"
-"""Purple: what follows from a pose that was given (GPS), noisy or attacked."""
+"""Purple: results with a given pose (GPS), noisy or attacked."""
 TRUTH = "#8A8A8A"
-"""Grey: how things really are."""
+"""Grey: ground truth."""
 
 _SETTINGS: Any = {
     "font.size": 11.0,
@@ -61,7 +61,7 @@ _SETTINGS: Any = {
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure in the project's style, whose parts make room for each other.
+    """An empty figure in the project's style with constrained layout.
 
     Args:
         width: of the picture [inches].
@@ -86,7 +86,7 @@ def add_axes(figure: Figure, rows: int, columns: int, heights: Sequence[float] |
 
 
 def style_bev(axes: Axes, title: str) -> None:
-    """Make a plot a map: the same scale on both axes, metres, a light grid."""
+    """Format a plot as a map: equal scales in metres, a light grid."""
     set_title(axes, title)
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x, forward [m]")
@@ -101,7 +101,7 @@ def light_grid(axes: Axes) -> None:
 
 
 def set_title(axes: Axes, title: str, size: float = 12.0) -> None:
-    """The title of one plot, at its left, in bold [points]."""
+    """Set the title of a plot, left-aligned and bold; size in points."""
     axes.set_title(title, loc="left", fontsize=size, fontweight="bold")
 
 
@@ -121,7 +121,7 @@ def same_scale(plots: Sequence[Axes], margin: float = 2.0) -> None:
 
 
 def legend_below(figure: Figure, columns: int = 6) -> None:
-    """One legend for the figure, under its plots: the labelled things of all of them, each label once."""
+    """Add one legend below the plots, with each label of any plot once."""
     named: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -131,12 +131,12 @@ def legend_below(figure: Figure, columns: int = 6) -> None:
 
 
 def is_cobevglue(name: str) -> bool:
-    """Whether a row or a line of this name is CoBEVGlue's, which is set off."""
+    """Whether a row or a line of this name is CoBEVGlue's, which is highlighted."""
     return name.casefold().startswith("cobevglue")
 
 
 def figure_png(figure: Figure, dpi: float = 110.0) -> bytes:
-    """A picture as the bytes of a PNG file, `dpi` dots per inch."""
+    """The figure as the bytes of a PNG file with `dpi` dots per inch."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=dpi)
     return file.getvalue()

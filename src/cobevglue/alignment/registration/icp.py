@@ -59,7 +59,7 @@ class _ICP(PointAligner):
         """
 
     def prepare(self, points: FloatArray) -> Any:
-        """What is needed of the ego's (N, D) points whoever the other is."""
+        """What is computed once from the ego's (N, D) points for all collaborators."""
         return points
 
     def align_group(
