@@ -30,7 +30,7 @@ def test_stamps_since_1970_in_other_units_are_errors(time: float, unit: str) -> 
         BEVGlue().align(NOTHING, NOTHING, time=time)
 
 
-@pytest.mark.parametrize("step", [0.0, 1e-310, 1e-9])
+@pytest.mark.parametrize("step", [0.0, 1e-310, 1e-11])
 def test_steps_too_short_for_velocities_are_errors(step: float) -> None:
     clock = Clock(0.1)
     clock.advance(0.0)

@@ -9,8 +9,8 @@ __all__ = ["SHORTEST_STEP", "Clock"]
 
 _LATEST = 1e11
 """Times from here on are in no unit of seconds: since 1970, this is the year 5138 [s]."""
-SHORTEST_STEP = 1e-6
-"""Two times that differ by less are one: velocities between them would be meaningless [s]."""
+SHORTEST_STEP = 1e-10
+"""Two times that differ by less, a tenth of a nanosecond, are one [s]."""
 _LONG_STEP = 20.0
 """A step between frames that is implausible if it comes again and again: 20 ms in milliseconds [s]."""
 _LONG_STEPS = 3
