@@ -1,4 +1,4 @@
-"""What travels between agents: the object message and arrays in bytes, and the object list as a JSON file.
+"""Messages between agents: the object message and arrays in bytes, and the object list as a JSON file.
 
 `cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message.
 """

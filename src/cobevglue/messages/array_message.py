@@ -1,4 +1,4 @@
-"""Named arrays as bytes: how feature maps, points, scored boxes and poses travel.
+"""Named arrays as bytes: the encoding of feature maps, points, scored boxes and poses.
 
 Layout of version 1, little endian throughout:
 
@@ -32,7 +32,7 @@ from cobevglue.messages.object_message import MessageError
 __all__ = ["Arrays", "decode_arrays", "encode_arrays"]
 
 Arrays = Mapping[str, NDArray[Any]]
-"""What travels, by name."""
+"""Arrays by name."""
 
 _MAGIC, _VERSION = b"CBVA", 1
 _HEADER = struct.Struct("<4sBB")

@@ -1,4 +1,4 @@
-"""The tables of the paper, and some more: for each what is to be run, and how the table is made of the results."""
+"""The tables of the paper and further ones: for each the conditions to run, and the table made of the results."""
 
 from __future__ import annotations
 
@@ -38,6 +38,6 @@ def experiments_named(names: Sequence[str]) -> list[Experiment]:
 
 
 def conditions_of(experiments: Sequence[Experiment], scope: Scope) -> list[Condition]:
-    """Everything that is to be run for these experiments, each condition once."""
+    """All conditions of these experiments, without duplicates."""
     conditions = [condition for experiment in experiments for condition in experiment.conditions(scope)]
     return list({condition.key: condition for condition in conditions}.values())

@@ -1,4 +1,4 @@
-"""Table 3 of the paper: what geometry and tracking are worth to the matching."""
+"""Table 3 of the paper: ablation of geometry and tracking in the matching."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table 2 of the paper: every method that trusts poses under attack, without and with BEVGlue."""
+"""Table 2 of the paper: every method that uses claimed poses under attack, without and with BEVGlue."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         last += [value] + ([None] if published else [])
     rows.append(last)
     notes: tuple[str, ...] = (
-        "Without: poses from where the method's own paper has them; CoBEVGlue's fusion trusts the claims here. With: "
-        "poses from BEVGlue, which sees no claim.",
+        "Without: poses from the source of the method's paper; for CoBEVGlue's fusion the claimed ones. With: "
+        "poses from BEVGlue, which receives no claimed pose.",
         "Added bytes: what BEVGlue sends, as a share of what the method sends for fusion, both as encoded. Features "
         "travel in 16 bits.",
     )

@@ -1,4 +1,4 @@
-"""What collaboration costs: bytes and time."""
+"""Communication volume and run time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the paper does not try: other attacks, lost and late messages."""
+"""Disturbances beyond the paper: other attacks, lost and late messages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
             rows.append([title, *cells])
         rows.append(["no collaboration", results.ap(as_is("none"), iou, every), *[None] * (len(_rows(scope)) - 1)])
         title = f"AP@{iou:g} under further disturbances"
-        notes = (f"On one frame in {every}; CoBEVGlue, who remembers, is run on those between, too.",)
+        notes = (f"On one frame in {every}; CoBEVGlue, which filters over time, is run on all frames.",)
         tables.append(Table(f"disturbances_ap{iou:g}", title, ("what goes wrong", *_rows(scope)), rows, notes))
     ours = scope.ours
     rows = []

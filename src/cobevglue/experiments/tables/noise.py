@@ -19,7 +19,7 @@ def _rows(scope: Scope) -> dict[tuple[str, str, str], list[Condition]]:
     rows = {}
     for name in scope.methods:
         source = "" if name == "none" else aligner_title(FUSION_METHODS[name].usual_aligner)
-        # Who listens to nobody is the same at every level.
+        # No collaboration is the same at every level.
         levels = [0.0] * len(scope.levels) if name == "none" else scope.levels
         rows[method_title(name), source, name] = [as_is(name, level) for level in levels]
     rows[_GIVEN, "given pose", ""] = [as_is(scope.ours, level, "given") for level in scope.levels]

@@ -11,7 +11,7 @@ __all__ = ["REGISTRATION", "registration_points"]
 
 
 def _levels(scope: Scope, aligner: str) -> list[float | None]:
-    """Of the initial pose; None for what needs none."""
+    """Noise of the initial pose; None for aligners without one."""
     return [*scope.registration_levels] if needs(aligner, "pose") else [None]
 
 

@@ -1,4 +1,4 @@
-"""What a table is made of: how wide it is, how conditions of several tables are spelled, and what rows are called."""
+"""The scope of a study, the conditions that several tables share, and the titles of rows."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _ALWAYS = ("none", "cobevglue-features", "cobevglue")
 
 @dataclass(frozen=True)
 class Scope:
-    """How many conditions there are.
+    """The range of conditions.
 
     Attributes:
         levels: of localisation noise, standard deviations in metres and in degrees; from none to strong.
@@ -88,7 +88,7 @@ class Scope:
 
     @property
     def trusting(self) -> list[str]:
-        """The methods that collaborate and whose poses come from localisation, corrected or not."""
+        """The collaborative methods with poses from localisation, corrected or not."""
         return [name for name in self.methods if name != "none" and FUSION_METHODS[name].usual_aligner != "bevglue"]
 
     @property
@@ -103,7 +103,7 @@ class Scope:
 
     @property
     def registrations(self) -> list[str]:
-        """The aligners that look at points."""
+        """The aligners that use points."""
         return [name for name in ALIGNERS if needs(name, "points")]
 
 
@@ -117,12 +117,12 @@ QUICK = Scope(
     bandwidth_every=3,
     trusting_every=3,
 )
-"""Minutes, to see that everything works."""
+"""A smoke test that takes minutes."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Some tables that belong together.
+    """A group of tables.
 
     Attributes:
         name: short, as users type it.
@@ -154,7 +154,7 @@ def attacked(fusion: str, aligner: str | None = None) -> Condition:
 
 
 def needs(aligner: str, what: Need) -> bool:
-    """Whether a source of poses looks at such things."""
+    """Whether an aligner uses data of this kind."""
     kind = ALIGNERS[aligner]
     return what in kind.needs if issubclass(kind, GroupAligner) else what == "boxes"
 
@@ -167,15 +167,15 @@ PAPERS = (
 
 
 def level_name(level: float) -> str:
-    """A level of noise as the paper writes it."""
+    """A noise level in the notation of the paper."""
     return f"{level:.1f}/{level:.1f}"
 
 
 def method_title(name: str) -> str:
-    """A fusion method as papers write it."""
+    """The name of a fusion method in the literature."""
     return _METHOD_TITLES.get(name, name)
 
 
 def aligner_title(name: str) -> str:
-    """A source of poses for people."""
+    """The title of a source of poses."""
     return _ALIGNER_TITLES.get(name, name)

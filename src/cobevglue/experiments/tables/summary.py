@@ -1,4 +1,4 @@
-"""The numbers to look at first, data sets side by side."""
+"""The main results, with a column for each data set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["summary"]
 
 
 def summary(scope: Scope, parts: Mapping[str, Results]) -> Table:
-    """What was to be shown, for each data set; rows whose conditions were not run are left out.
+    """The main results of each data set; rows whose conditions were not run are left out.
 
     Args:
         scope: of the study.
@@ -48,7 +48,7 @@ def summary(scope: Scope, parts: Mapping[str, Results]) -> Table:
 
 
 def _below(scope: Scope, results: Results) -> str | None:
-    """The methods that trust poses and are worse than nothing under the strongest noise."""
+    """The methods that are worse than no collaboration under the strongest noise."""
     conditions = {name: as_is(name, scope.levels[-1]) for name in scope.trusting}
     if not all(results.has(condition) for condition in (*conditions.values(), as_is("none"))):
         return None
