@@ -147,7 +147,7 @@ def test_nodes_find_each_other(run_node: Callable[..., LiveNode]) -> None:
     counted = {(s.name, *s.labels.values()): s.value for s in samples}
     assert counted["cobevglue_refused_total", "corrupted"] == 1
     assert counted["cobevglue_lists_refused_total",] == 1
-    assert counted["cobevglue_received_total", "car2"] > 1
+    assert counted["cobevglue_received_total", "car2"] >= 1
 
     assert car1.end(signal.SIGINT) == 0
     car2.process.stdin.close()  # type: ignore[union-attr]
