@@ -111,6 +111,7 @@ class Scene:
     def feed(self, *nodes: LiveNode) -> None:
         frame = frames()[self.step % len(frames())]
         self.step += 1
+        time.sleep(0.01)  # two lists less than a millisecond apart are one
         for node in nodes:
             view = frame.agents[node.agent]
             node.say(write_list(OwnList(view.boxes, time.time(), view.body)))
