@@ -42,12 +42,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from cobevglue.boxes import Boxes, covers_origin
+from cobevglue.boxes import Boxes
 from cobevglue.messages.asn1_codec import CPM
-from cobevglue.messages.cpm_objects import Columns, objects_from_columns, read_objects
-from cobevglue.messages.fields import check_range, column, sent_ids, whole_bytes
+from cobevglue.messages.columns import Columns
+from cobevglue.messages.cpm_objects import objects_from_columns, read_objects
+from cobevglue.messages.fields import check_range, check_station_id, column, sent_ids, station_id_of, whole_bytes
 from cobevglue.messages.object_message import MessageError, ObjectMessage
 from cobevglue.typing import FloatArray
 
@@ -114,9 +113,7 @@ class CollectivePerception:
     omitted: int = 0
 
     def __post_init__(self) -> None:
-        if isinstance(self.station_id, bool) or not isinstance(self.station_id, (int, np.integer)):
-            raise MessageError(f"station_id must be a whole number, got {self.station_id!r}")
-        check_range("station_id", self.station_id, 0, 2**32 - 1)
+        check_station_id(self.station_id)
         check_range("time", self.time, 0.0, _MAX_TIME)
         for name, limit in (("latitude", 90.0), ("longitude", 180.0), ("heading", math.inf)):
             if getattr(self, name) is not None:
@@ -158,9 +155,7 @@ class CollectivePerception:
             MessageError: the agent id is not a number, or a field is outside of its limits.
         """
         if "station_id" not in fields:
-            if not (message.agent_id.isascii() and message.agent_id.isdigit()):
-                raise MessageError(f"agent_id must be a station id, 0 to 2^32 - 1, got {message.agent_id!r}")
-            fields["station_id"] = int(message.agent_id)
+            fields["station_id"] = station_id_of(message)
         return cls(time=message.time, boxes=message.boxes, body=message.body, **fields)
 
     def object_message(self, frame: int = 0) -> ObjectMessage:
@@ -236,7 +231,7 @@ def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
         columns, omitted = read_objects(objects, heading or 0.0)
     except ValueError as error:
         raise MessageError(f"invalid boxes: {error}") from None
-    columns, body = _split_body(columns)
+    columns, body = columns.split_own_vehicle(OWN_VEHICLE)
     management = payload["managementContainer"]
     position = management["referencePosition"]
     return CollectivePerception(
@@ -315,21 +310,7 @@ def _columns(message: CollectivePerception) -> Columns:
     )
     if message.body is None:
         return columns
-    if not covers_origin(message.body)[0]:
-        raise MessageError("body must stand on the origin of the frame, the reference position")
     return columns.with_own_vehicle(message.body, OWN_VEHICLE)
-
-
-def _split_body(columns: Columns) -> tuple[Columns, Boxes | None]:
-    """Separate the own vehicle: the object with its id, if it stands on the reference position."""
-    ids = columns.boxes.track_id
-    if ids is None:
-        return columns, None
-    own = (ids == OWN_VEHICLE) & covers_origin(columns.boxes)
-    if not own.any():
-        return columns, None
-    body = columns.boxes[own]
-    return columns[~own], Boxes(body.center, body.size, body.yaw)
 
 
 def _known(value: int, unavailable: int, unit: float) -> float | None:

@@ -8,10 +8,19 @@ from typing import Any
 import numpy as np
 
 from cobevglue.boxes import Boxes
-from cobevglue.messages.object_message import MessageError
+from cobevglue.messages.object_message import MessageError, ObjectMessage
 from cobevglue.typing import ArrayLike, FloatArray, IntArray
 
-__all__ = ["check_range", "column", "sent_ids", "whole_bytes"]
+__all__ = [
+    "check_range",
+    "check_station_id",
+    "column",
+    "rounded",
+    "sent_ids",
+    "station_id_of",
+    "whole_bytes",
+    "whole_units",
+]
 
 
 def whole_bytes(data: Any) -> bytes:
@@ -54,3 +63,33 @@ def column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray |
         raise MessageError(f"{name} must have shape {shape}, got {array.shape}")
     array.setflags(write=False)
     return array
+
+
+def check_station_id(value: Any) -> None:
+    """MessageError if the value is no whole number of 32 bits."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise MessageError(f"station_id must be a whole number, got {value!r}")
+    check_range("station_id", value, 0, 2**32 - 1)
+
+
+def station_id_of(message: ObjectMessage) -> int:
+    """The agent id of an object message as a number; MessageError if it is none."""
+    if not (message.agent_id.isascii() and message.agent_id.isdigit()):
+        raise MessageError(f"agent_id must be a station id, 0 to 2^32 - 1, got {message.agent_id!r}")
+    return int(message.agent_id)
+
+
+def whole_units(name: str, values: FloatArray, unit: float, limit: int, holder: str) -> IntArray:
+    """Values in whole units; MessageError if one is beyond the limit of the holder, a message."""
+    units = rounded(np.clip(values / unit, -2.0 * limit, 2.0 * limit))
+    beyond = ~np.isfinite(values) | (np.abs(units) > limit)
+    if beyond.any():
+        row = int(beyond.reshape(len(values), -1).any(axis=1).argmax())
+        raise MessageError(f"{name}: row {row} is {values[row].tolist()}, {holder} holds at most {limit * unit:g}")
+    return units
+
+
+def rounded(values: FloatArray) -> IntArray:
+    """To the nearest whole number, 0 for NaN."""
+    units: IntArray = np.nan_to_num(np.rint(values)).astype(np.int64)
+    return units
