@@ -29,8 +29,8 @@ How the fields are filled:
   along the sender's own axes: a profile of ours, as for the CPM.
 - An object has a direction of motion and a speed, and no other velocity: what is across of yaw is not sent.
 - `body` is sent as one more object, as in a CPM. Confidences are sent as unavailable, and not read.
-- Not confirmed for want of the standard: that x is east and y is north, the sign of measurementTime (positive: after the
-  time stamp, here), and that objects other than obstacles may have a size in detObst.
+- Not confirmed for want of the standard: that x is east and y is north, the sign of measurementTime (positive: after
+  the time stamp, here), and that objects other than obstacles may have a size in detObst.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def _date(time: float) -> dict[str, int]:
 def _time(date: dict[str, int]) -> float:
     """Seconds since 1970 of a DDateTime; MessageError if it is not complete."""
     try:
-        start = datetime(*(date[name] for name in ("year", "month", "day", "hour", "minute")), tzinfo=timezone.utc)
+        start = datetime(date["year"], date["month"], date["day"], date["hour"], date["minute"], tzinfo=timezone.utc)
         milliseconds = date["second"]
     except (KeyError, ValueError):
         raise MessageError(f"sDSMTimeStamp is not a complete date and time: {date}") from None

@@ -163,17 +163,18 @@ def is_elsewhere(frame: str, own_frame: str | None) -> bool:
 
 
 def _decoded(data: bytes) -> ObjectMessage:
-    """The object message in these bytes, or that of the CPM in them, with or without the header of its transport."""
+    """The object message in these bytes, or that of the CPM or SDSM in them, with or without the header of its transport."""
     if data.startswith(_OBJECT_MESSAGE):
         return decode(data)
-    from cobevglue.messages import cpm
+    from cobevglue.messages import cpm, sdsm
 
     if data.startswith(_CPM_PORT):
         data = data[4:]
     try:
-        return cpm.decode(data).object_message()
+        message = sdsm.decode(data) if data.startswith(_SDSM) else cpm.decode(data)
+        return message.object_message()
     except MessageError as error:
-        raise MessageError(f"neither a CPM nor a message of cobevglue: {error}") from None
+        raise MessageError(f"neither a CPM, an SDSM nor a message of cobevglue: {error}") from None
 
 
 def _check_boxes(boxes: Boxes) -> None:
