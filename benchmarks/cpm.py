@@ -72,13 +72,13 @@ def main() -> None:
     tables: dict[str, Table] = {}
     for name, table in TABLES.items():
         if arguments.only in (None, name):
-            tables[name] = table(DATA)
+            tables[name] = table(arguments)
             sys.stdout.flush()
     if arguments.json:
         arguments.json.write_text(json.dumps(tables, indent=1))
 
 
-def sizes(data: Path) -> Table:
+def sizes(_arguments: argparse.Namespace) -> Table:
     """Bytes of a message, and the time of encoding and of decoding it."""
     print("## Messages of random boxes (agent id of one character, body not sent)\n")
     table: Table = []
@@ -142,7 +142,7 @@ def perception(boxes: Boxes, **fields: Any) -> cpm.CollectivePerception:
     )
 
 
-def alignment(data: Path) -> Table:
+def alignment(arguments: argparse.Namespace) -> Table:
     """BEVGlue on lists that went through a message, and on those that did not."""
     print("## V2V4Real detections, the other car's list sent in different ways (means of the runs)\n")
     table: Table = []
@@ -155,12 +155,16 @@ def alignment(data: Path) -> Table:
         "SDSM, axes of the sender": [by_sdsm(None)],
         "SDSM, axes turned from the sender's": [by_sdsm(turn) for turn in np.arange(1, RUNS) * 0.7],
     }
-    folder, cars = data / "v2v4real_detections", data / "v2v4real_cars.csv"
+    folder, cars = DATA / "v2v4real_detections", DATA / "v2v4real_cars.csv"
     for split, names in (("train", V2V4REAL_TRAIN), ("val", V2V4REAL_VAL)):
+        if split not in arguments.splits:
+            continue
         constant = v2v4real_sequences(folder, names, moving=False)
         own = v2v4real_car_sequences(folder, cars, names, bodies=True)
         for frames, sequences in (("constant frame", constant), ("own frames, with bodies", own)):
             for what, runs in channels.items():
+                if arguments.channels not in what:
+                    continue
                 records = [run([sent(s, channel) for s in sequences], BEVGlue) for channel in runs]
                 table.append({"what": f"{split}, {frames}, {what}", **spread(records)})
                 print("   …", table[-1]["what"], file=sys.stderr)

@@ -163,7 +163,7 @@ def is_elsewhere(frame: str, own_frame: str | None) -> bool:
 
 
 def _decoded(data: bytes) -> ObjectMessage:
-    """The object message in these bytes, or that of the CPM or SDSM in them, with or without the header of its transport."""
+    """The object message in these bytes, or that of the SDSM or CPM in them, a CPM also behind its transport header."""
     if data.startswith(_OBJECT_MESSAGE):
         return decode(data)
     from cobevglue.messages import cpm, sdsm
