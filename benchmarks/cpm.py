@@ -2,7 +2,7 @@
 
     python benchmarks/cpm.py                     # everything below, about 8 minutes
     python benchmarks/cpm.py --only bytes        # bytes and times of messages of 1, 16, 40 boxes
-    python benchmarks/cpm.py --only alignment    # V2V4Real, the other car's list sent as it is, by our message, by CPM or SDSM
+    python benchmarks/cpm.py --only alignment    # V2V4Real, the other car's list sent in different ways
     python benchmarks/cpm.py --only alignment --channels SDSM    # a part of it
     python benchmarks/cpm.py --json results.json
     python benchmarks/cpm.py --picture docs/images/cpm.png    # only the picture of docs/cpm.md
@@ -230,7 +230,7 @@ def by_sdsm(turn: float | None) -> Channel:
     """The other's list and body after they were sent as an SDSM.
 
     Args:
-        turn: yaw of the sender's x axis from east [rad], constant over a sequence; None if it does not know its heading.
+        turn: yaw of the sender's x axis from east [rad], the same in all frames; None if it is not known.
     """
 
     def channel(frame: PairFrame) -> Received:

@@ -346,6 +346,15 @@ def test_message_that_cannot_be_used_is_named(change: Callable[[Any], None], exp
         decode(_bytes(value))
 
 
+def test_number_beyond_its_limit_is_refused() -> None:
+    """16 bits also hold 32768, which no offset is; 15 bits hold headings above a whole turn."""
+    data = encode(message(boxes=boxes(1, center=[(3276.7, 0.0, 0.0)])))
+    value = int.from_bytes(data, "big")
+    shift = next(s for s in range(8 * len(data)) if (value >> s) & 0xFFFF == 65534 and (value >> s + 16) & 1)
+    with pytest.raises(MessageError, match="offsetX"):
+        decode((value + (1 << shift)).to_bytes(len(data), "big"))
+
+
 def test_message_of_another_kind_is_refused() -> None:
     with pytest.raises(MessageError, match="not an SDSM: it has messageId 20, not 41"):
         decode(SDSM.encode("MessageFrame", {"messageId": 20, "value": b"\0"}))

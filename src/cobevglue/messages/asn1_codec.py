@@ -21,9 +21,11 @@ class Codec:
 
     Attributes:
         path: of the file.
+        check_received: whether `decode` refuses numbers beyond their limits, which the bits of some types can hold.
     """
 
     path: Path
+    check_received: bool = False
 
     def encode(self, name: str, value: Any) -> bytes:
         """Encode a value of the type of this name.
@@ -50,7 +52,7 @@ class Codec:
         """
         specification = _specification(self.path)
         try:
-            return specification.decode(name, data)
+            return specification.decode(name, data, check_constraints=self.check_received)
         except (
             Exception
         ) as error:  # asn1tools raises whatever its own code runs into: IndexError, KeyError, OverflowError
@@ -70,7 +72,7 @@ class Codec:
 
 CPM = Codec(Path(__file__).with_name("cpm.asn"))
 """ETSI's types."""
-SDSM = Codec(Path(__file__).with_name("sdsm.asn"))
+SDSM = Codec(Path(__file__).with_name("sdsm.asn"), check_received=True)
 """SAE's types."""
 
 
