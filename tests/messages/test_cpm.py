@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import runpy
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ from cobevglue.messages.asn1_codec import CPM
 from cobevglue.messages.cpm import MAX_OBJECTS, OWN_VEHICLE, CollectivePerception, decode, encode
 
 from .sample_boxes import boxes
+from .second_encoder import compiled
 
 ARRAYS = ("velocity", "age", "measurement_offset", "position_std", "yaw_std")
 BODY = Boxes([(0.4, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
@@ -135,7 +134,6 @@ def test_bits_of_a_message_by_hand() -> None:
 @pytest.fixture(scope="module")
 def pycrate(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Pycrate's codecs, of the same types with the open type and the union as the standard has them."""
-    compiler = pytest.importorskip("pycrate_asn1c.asnproc")
     text = CPM.path.read_text(encoding="utf-8")
     for ours, standard in (
         ("containerId    CpmContainerId,", "containerId CPM-CONTAINER-ID-AND-TYPE.&id({CpmContainers}),"),
@@ -153,10 +151,7 @@ def pycrate(tmp_path_factory: pytest.TempPathFactory) -> Any:
     ):
         assert ours in text
         text = text.replace(ours, standard)
-    compiler.compile_text(text)
-    path = tmp_path_factory.mktemp("pycrate") / "compiled.py"
-    compiler.generate_modules(compiler.PycrateGenerator, str(path))
-    return SimpleNamespace(**runpy.run_path(str(path))).CPM_PDU_Descriptions
+    return compiled(text, tmp_path_factory.mktemp("pycrate")).CPM_PDU_Descriptions
 
 
 CONTAINERS = {

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import runpy
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ from cobevglue.messages.asn1_codec import SDSM
 from cobevglue.messages.sdsm import MAX_OBJECTS, OWN_VEHICLE, SensorDataSharing, decode, encode
 
 from .sample_boxes import boxes
+from .second_encoder import compiled
 
 BODY = Boxes([(0.4, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
 
@@ -132,11 +131,7 @@ def test_bits_of_a_message_by_hand() -> None:
 @pytest.fixture(scope="module")
 def pycrate(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Pycrate's codecs of the same types."""
-    compiler = pytest.importorskip("pycrate_asn1c.asnproc")
-    compiler.compile_text(SDSM.path.read_text(encoding="utf-8"))
-    path = tmp_path_factory.mktemp("pycrate") / "compiled.py"
-    compiler.generate_modules(compiler.PycrateGenerator, str(path))
-    return SimpleNamespace(**runpy.run_path(str(path))).SDSM
+    return compiled(SDSM.path.read_text(encoding="utf-8"), tmp_path_factory.mktemp("pycrate")).SDSM
 
 
 @pytest.mark.parametrize("seed", range(10))
