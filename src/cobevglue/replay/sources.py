@@ -27,8 +27,8 @@ _VEHICLE = "base_link"
 _FARTHEST, _LARGEST = 10_000.0, 1_000.0
 """Of the objects that an agent can see: distance and size [m]; beyond, they are not in its frame, or damaged."""
 _CPM_PORT = (2009).to_bytes(2, "big")
-_SDSM = b"\x00\x29"  # a MessageFrame with the id of an SDSM
 """Destination port of CPMs in the header of ETSI's basic transport protocol, which precedes them in packets."""
+_SDSM = b"\x00\x29"  # a MessageFrame with the id of an SDSM
 _OBJECT_MESSAGE = b"CBVG"
 
 
