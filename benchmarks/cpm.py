@@ -96,12 +96,12 @@ def sizes(_arguments: argparse.Namespace) -> Table:
             ("and velocities, ages, accuracies", perception(classes, **kinematics, **accuracy)),
         ):
             table.append(measured(f"CPM, {n} boxes, {what}", message, cpm.encode, cpm.decode))
-        for what, sent_boxes, fields in (
-            ("boxes only", boxes, {}),
-            ("and classes, scores, velocities", classes, {"velocity": kinematics["velocity"]}),
+        for what, sent_boxes, velocity in (
+            ("boxes only", boxes, None),
+            ("and classes, scores, velocities", classes, kinematics["velocity"]),
         ):
             own_sdsm = sdsm.SensorDataSharing(
-                7, 12.5, sent_boxes, heading=0.3, latitude=42.3, longitude=-83.0, **fields
+                7, 12.5, sent_boxes, heading=0.3, latitude=42.3, longitude=-83.0, velocity=velocity
             )
             table.append(measured(f"SDSM, {n} boxes, {what}", own_sdsm, sdsm.encode, sdsm.decode))
     show(table)

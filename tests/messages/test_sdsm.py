@@ -86,7 +86,8 @@ def test_round_trip_is_exact_to_the_units(sent: SensorDataSharing, speeds: list[
     assert np.abs(got.boxes.size - expected.size).max() <= 0.0501
     assert np.abs(wrap_angle(got.boxes.yaw - expected.yaw)).max() <= math.radians(0.00626)
     np.testing.assert_array_equal(got.boxes.track_id, sent.boxes.track_id)
-    if sent.boxes.score is None:
+    if sent.boxes.score is None or got.boxes.score is None:
+        assert sent.boxes.score is None
         assert got.body is not None or got.boxes.score is None
     else:
         np.testing.assert_allclose(got.boxes.score, sent.boxes.score, atol=0.00501)
