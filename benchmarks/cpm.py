@@ -1,8 +1,9 @@
-"""What ETSI's CPM costs against our own object message: bytes, time, and alignments.
+"""What ETSI's CPM and SAE's SDSM cost against our own object message: bytes, time, and alignments.
 
-    python benchmarks/cpm.py                     # everything below, about 5 minutes
+    python benchmarks/cpm.py                     # everything below, about 8 minutes
     python benchmarks/cpm.py --only bytes        # bytes and times of messages of 1, 16, 40 boxes
-    python benchmarks/cpm.py --only alignment    # V2V4Real, the other car's list sent as it is, by our message, by CPM
+    python benchmarks/cpm.py --only alignment    # V2V4Real, the other car's list sent in different ways
+    python benchmarks/cpm.py --only alignment --channels SDSM    # a part of it
     python benchmarks/cpm.py --json results.json
     python benchmarks/cpm.py --picture docs/images/cpm.png    # only the picture of docs/cpm.md
 
@@ -32,7 +33,8 @@ from cobevglue.evaluation.alignment_data import (
     v2v4real_car_sequences,
     v2v4real_sequences,
 )
-from cobevglue.messages import ObjectMessage, cpm, decode, encode
+from cobevglue.messages import ObjectMessage, cpm, decode, encode, sdsm
+from cobevglue.se2 import SE2
 from cobevglue.visualization.style import (
     EGO,
     MATCH,
@@ -58,6 +60,8 @@ def main() -> None:
     """Print the tables and, on request, write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=tuple(TABLES))
+    parser.add_argument("--channels", default="", help="only ways to send whose name holds this")
+    parser.add_argument("--splits", nargs="+", choices=("train", "val"), default=["train", "val"])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
@@ -68,13 +72,13 @@ def main() -> None:
     tables: dict[str, Table] = {}
     for name, table in TABLES.items():
         if arguments.only in (None, name):
-            tables[name] = table(DATA)
+            tables[name] = table(arguments)
             sys.stdout.flush()
     if arguments.json:
         arguments.json.write_text(json.dumps(tables, indent=1))
 
 
-def sizes(data: Path) -> Table:
+def sizes(_arguments: argparse.Namespace) -> Table:
     """Bytes of a message, and the time of encoding and of decoding it."""
     print("## Messages of random boxes (agent id of one character, body not sent)\n")
     table: Table = []
@@ -92,6 +96,14 @@ def sizes(data: Path) -> Table:
             ("and velocities, ages, accuracies", perception(classes, **kinematics, **accuracy)),
         ):
             table.append(measured(f"CPM, {n} boxes, {what}", message, cpm.encode, cpm.decode))
+        for what, sent_boxes, velocity in (
+            ("boxes only", boxes, None),
+            ("and classes, scores, velocities", classes, kinematics["velocity"]),
+        ):
+            own_sdsm = sdsm.SensorDataSharing(
+                7, 12.5, sent_boxes, heading=0.3, latitude=42.3, longitude=-83.0, velocity=velocity
+            )
+            table.append(measured(f"SDSM, {n} boxes, {what}", own_sdsm, sdsm.encode, sdsm.decode))
     show(table)
     return table
 
@@ -130,7 +142,7 @@ def perception(boxes: Boxes, **fields: Any) -> cpm.CollectivePerception:
     )
 
 
-def alignment(data: Path) -> Table:
+def alignment(arguments: argparse.Namespace) -> Table:
     """BEVGlue on lists that went through a message, and on those that did not."""
     print("## V2V4Real detections, the other car's list sent in different ways (means of the runs)\n")
     table: Table = []
@@ -140,13 +152,19 @@ def alignment(data: Path) -> Table:
         "object message": [by_object_message],
         "CPM, heading known": [by_cpm(turn) for turn in np.arange(RUNS) * 0.7],
         "CPM, heading unknown": [by_cpm(None)],
+        "SDSM, axes of the sender": [by_sdsm(None)],
+        "SDSM, axes turned from the sender's": [by_sdsm(turn) for turn in np.arange(1, RUNS) * 0.7],
     }
-    folder, cars = data / "v2v4real_detections", data / "v2v4real_cars.csv"
+    folder, cars = DATA / "v2v4real_detections", DATA / "v2v4real_cars.csv"
     for split, names in (("train", V2V4REAL_TRAIN), ("val", V2V4REAL_VAL)):
+        if split not in arguments.splits:
+            continue
         constant = v2v4real_sequences(folder, names, moving=False)
         own = v2v4real_car_sequences(folder, cars, names, bodies=True)
         for frames, sequences in (("constant frame", constant), ("own frames, with bodies", own)):
             for what, runs in channels.items():
+                if arguments.channels not in what:
+                    continue
                 records = [run([sent(s, channel) for s in sequences], BEVGlue) for channel in runs]
                 table.append({"what": f"{split}, {frames}, {what}", **spread(records)})
                 print("   …", table[-1]["what"], file=sys.stderr)
@@ -204,6 +222,28 @@ def by_cpm(turn: float | None) -> Channel:
         heading = None if turn is None else frame.ego_SE2_other.yaw + turn
         message = cpm.decode(cpm.encode(cpm.CollectivePerception(7, 1.0, boxes, body, heading=heading)))
         return message.boxes, message.body
+
+    return channel
+
+
+def by_sdsm(turn: float | None) -> Channel:
+    """The other's list and body after they were sent as an SDSM.
+
+    Args:
+        turn: yaw of the sender's x axis from east [rad], the same in all frames; None if it is not known.
+    """
+
+    def channel(frame: PairFrame) -> Received:
+        boxes = frame.other.replace(score=None, label=None)
+        body = None if frame.other_body is None else frame.other_body.replace(score=None, label=None)
+        if len(boxes) == 0 and body is None:
+            return boxes, body  # an SDSM holds at least one object: none is sent
+        message = sdsm.decode(sdsm.encode(sdsm.SensorDataSharing(7, 1.0, boxes, body, heading=turn)))
+        if turn is None:
+            return message.boxes, message.body
+        own_SE2_axes = SE2(0.0, 0.0, -turn)  # back, as the truth is in the sender's frame
+        turned = None if message.body is None else message.body.transform(own_SE2_axes)
+        return message.boxes.transform(own_SE2_axes), turned
 
     return channel
 

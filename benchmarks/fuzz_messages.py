@@ -4,7 +4,7 @@
     python benchmarks/fuzz_messages.py --messages 10000000   # for an hour or two
     python benchmarks/fuzz_messages.py --only cpm --seed 7
 
-Valid messages of both formats are damaged: flipped bits, other bytes, slices removed, doubled, or taken from another
+Valid messages of all formats are damaged: flipped bits, other bytes, slices removed, doubled, or taken from another
 message, cut off, special numbers. In half of the object messages the checksum is made right again afterwards, so that
 the damage gets past it. Then:
 
@@ -12,8 +12,8 @@ the damage gets past it. Then:
   processor time.
 - An object message that decodes has a valid checksum and means what its bytes say, by a second, plain reading of them.
   If its checksum was not made right again, it is byte for byte a message that was sent.
-- A CPM has no checksum: a flipped bit may move a box. Its boxes are finite and within the standard's ranges, and
-  encoding what was decoded and decoding that again gives the same boxes. With the node's session header, any CPM that
+- A CPM or SDSM has no checksum: a flipped bit may move a box. Its boxes are finite and within the standard's ranges,
+  and encoding what was decoded and decoding that again gives the same boxes. With the node's session header, any that
   was changed is refused.
 - A node goes through it all: it receives what decodes, and aligns.
 
@@ -32,18 +32,20 @@ import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cobevglue import Boxes
-from cobevglue.messages import MessageError, ObjectMessage, cpm, decode, encode
+from cobevglue.messages import MessageError, ObjectMessage, cpm, decode, encode, sdsm
 from cobevglue.messages.cpm import CollectivePerception
+from cobevglue.messages.sdsm import SensorDataSharing
 from cobevglue.node import NodeCore, OwnList, SessionHeader, decode_header, encode_header
 from cobevglue.typing import FloatArray
 from common import print_head
 
-FORMATS = ("object", "cpm")
+FORMATS = ("object", "cpm", "sdsm")
 SLOW = 1.0
 """A message may take so much processor time to decode [s]."""
 NODE_EVERY, ALIGN_EVERY = 10, 100
@@ -60,7 +62,8 @@ _SPECIAL += tuple(struct.pack("<f", value) for value in (3.4e38, -1.0, -2.0, 1e-
 _SPECIAL += tuple(struct.pack("<d", value) for value in (math.nan, -math.inf, 1e300, 1e11))
 _IN_PLACE, _ALL = (0, 1, 7, 8), tuple(range(9))
 """Kinds of damage that keep the length, and all."""
-_MOST_OBJECTS, _LARGEST_SIZE, _FARTHEST = 255, 25.5, 1310.71
+_LIMITS = {"cpm": (255, math.sqrt(2.0) * 1310.71, 25.5), "sdsm": (256, 3276.71, 102.31)}
+"""Most objects, largest coordinate and largest size [m] of the standards."""
 
 
 @dataclass
@@ -86,8 +89,8 @@ class Report:
 def main() -> None:
     """Damage messages until the time or their number is up."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0, help="for both formats together")
-    parser.add_argument("--messages", type=int, help="so many instead, half of each format")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for all formats together")
+    parser.add_argument("--messages", type=int, help="so many instead, the same number of each format")
     parser.add_argument("--only", choices=FORMATS)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -116,8 +119,8 @@ def fuzz(name: str, seed: int, messages: int, seconds: float = math.inf) -> Repo
         seconds: for how long at most [s].
     """
     stream = FORMATS.index(name)
-    originals = object_messages(seed) if name == "object" else cpms(seed)
-    check = check_object_message if name == "object" else check_cpm
+    originals = {"object": object_messages, "cpm": cpms, "sdsm": sdsms}[name](seed)
+    check = check_object_message if name == "object" else partial(check_standard_message, name)
     known = frozenset(originals)
     report, node = Report(), Node()
     batch, end = 0, time.monotonic() + seconds
@@ -137,7 +140,7 @@ def fuzz(name: str, seed: int, messages: int, seconds: float = math.inf) -> Repo
             started = time.thread_time()
             check(data, known, repaired, report)
             report.slowest = max(report.slowest, time.thread_time() - started)
-            if name == "cpm":
+            if name != "object":
                 check_header(original, data, report)
             if report.messages % NODE_EVERY == 0:
                 node.take(data, report)
@@ -210,10 +213,12 @@ def check_object_message(data: bytes, known: frozenset[bytes], repaired: bool, r
         report.fail("invalid boxes", data)
 
 
-def check_cpm(data: bytes, _known: frozenset[bytes], _repaired: bool, report: Report) -> None:
-    """A CPM is refused, or its boxes are within the standard's ranges and survive another round."""
+def check_standard_message(name: str, data: bytes, _known: frozenset[bytes], _repaired: bool, report: Report) -> None:
+    """A CPM or SDSM is refused, or its boxes are within the standard's ranges and survive another round."""
+    standard: Any = {"cpm": cpm, "sdsm": sdsm}[name]
+    most, farthest, largest = _LIMITS[name]
     try:
-        message = cpm.decode(data)
+        message = standard.decode(data)
     except MessageError as error:
         report.refuse(error)
         return
@@ -221,11 +226,11 @@ def check_cpm(data: bytes, _known: frozenset[bytes], _repaired: bool, report: Re
         report.fail(f"{type(error).__name__}: {error}", data)
         return
     report.accepted += 1
-    if len(message.boxes) > _MOST_OBJECTS or not plausible(message.boxes, math.sqrt(2.0) * _FARTHEST, _LARGEST_SIZE):
+    if len(message.boxes) > most or not plausible(message.boxes, farthest, largest):
         report.fail("boxes beyond the standard's ranges", data)
     if len(message.boxes) == 0 or message.boxes.track_id is not None:
-        try:
-            again = cpm.decode(cpm.encode(message))
+        try:  # an SDSM of which no object is a box cannot be sent again
+            again = standard.decode(standard.encode(message))
         except MessageError as error:
             report.refuse(error)
             return
@@ -342,6 +347,20 @@ def cpms(seed: int) -> list[bytes]:
         messages.append(
             cpm.encode(CollectivePerception(7 + index, 7e8, boxes, heading=heading, **more, **accuracy, **roadside))
         )
+    return messages
+
+
+def sdsms(seed: int) -> list[bytes]:
+    """Valid SDSMs of many kinds."""
+    messages = []
+    for index, n in enumerate((1, 2, 3, 6)):
+        rng = np.random.default_rng([seed, 12, index])
+        labels = np.array(["car", "pedestrian", "animal"])[np.arange(n) % 3]
+        boxes = random_boxes(rng, n, True).replace(label=labels, score=rng.uniform(0.0, 1.0, n))
+        more: dict[str, Any] = {"velocity": rng.normal(0.0, 10.0, (n, 2))} if index % 2 else {}
+        place: dict[str, Any] = {"latitude": 48.0, "longitude": -83.0, "heading": 0.5} if index > 1 else {}
+        body = Boxes([[0.0, 0.0, 0.0]], [[4.5, 1.9, 1.5]], [0.0]) if index == 3 else None
+        messages.append(sdsm.encode(SensorDataSharing(7 + index, 1.7e9, boxes, body, **more, **place)))
     return messages
 
 

@@ -10,7 +10,7 @@ import pytest
 from fuzz_messages import FORMATS, Report, check_header, check_object_message, fuzz, object_messages
 
 
-@pytest.mark.parametrize(("name", "messages"), [("object", 2000), ("cpm", 300)])
+@pytest.mark.parametrize(("name", "messages"), [("object", 2000), ("cpm", 300), ("sdsm", 300)])
 def test_damaged_messages_do_no_harm(name: str, messages: int) -> None:
     report = fuzz(name, 1, messages)
     assert report.failures == []

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import runpy
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +18,11 @@ from cobevglue.se2 import wrap_angle
 
 pytest.importorskip("asn1tools")
 
+from cobevglue.messages.asn1_codec import CPM
 from cobevglue.messages.cpm import MAX_OBJECTS, OWN_VEHICLE, CollectivePerception, decode, encode
-from cobevglue.messages.cpm_schema import SCHEMA, decode_type, encode_type
 
 from .sample_boxes import boxes
+from .second_encoder import compiled
 
 ARRAYS = ("velocity", "age", "measurement_offset", "position_std", "yaw_std")
 BODY = Boxes([(0.4, 0.0, -1.0)], [(4.5, 1.9, 1.6)], [0.0])
@@ -135,8 +134,7 @@ def test_bits_of_a_message_by_hand() -> None:
 @pytest.fixture(scope="module")
 def pycrate(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Pycrate's codecs, of the same types with the open type and the union as the standard has them."""
-    compiler = pytest.importorskip("pycrate_asn1c.asnproc")
-    text = SCHEMA.read_text(encoding="utf-8")
+    text = CPM.path.read_text(encoding="utf-8")
     for ours, standard in (
         ("containerId    CpmContainerId,", "containerId CPM-CONTAINER-ID-AND-TYPE.&id({CpmContainers}),"),
         ("containerData  OCTET STRING", "containerData CPM-CONTAINER-ID-AND-TYPE.&Type({CpmContainers}{@containerId})"),
@@ -153,10 +151,7 @@ def pycrate(tmp_path_factory: pytest.TempPathFactory) -> Any:
     ):
         assert ours in text
         text = text.replace(ours, standard)
-    compiler.compile_text(text)
-    path = tmp_path_factory.mktemp("pycrate") / "compiled.py"
-    compiler.generate_modules(compiler.PycrateGenerator, str(path))
-    return SimpleNamespace(**runpy.run_path(str(path))).CPM_PDU_Descriptions
+    return compiled(text, tmp_path_factory.mktemp("pycrate")).CPM_PDU_Descriptions
 
 
 CONTAINERS = {
@@ -196,10 +191,10 @@ def test_same_bytes_as_a_second_encoder(pycrate: Any, seed: int) -> None:
             yaw_std=rng.uniform(0, 0.3, n),
         )
     )
-    value = decode_type("CollectivePerceptionMessage", data)
+    value = CPM.decode("CollectivePerceptionMessage", data)
     for container in value["payload"]["cpmContainers"]:
         name = CONTAINERS[container["containerId"]]
-        container["containerData"] = (name, decode_type(name, container["containerData"]))
+        container["containerData"] = (name, CPM.decode(name, container["containerData"]))
     codec = pycrate.CollectivePerceptionMessage
     codec.set_val(value)
     assert codec.to_uper() == data
@@ -267,14 +262,14 @@ def test_fields_we_do_not_send_agree_too(pycrate: Any) -> None:
         ]
         for matrix in (((included << 3).to_bytes(2, "big"), 13), (included, 13))
     )
-    data = encode_type("PerceivedObjectContainer", {"numberOfPerceivedObjects": 2, "perceivedObjects": ours})
+    data = CPM.encode("PerceivedObjectContainer", {"numberOfPerceivedObjects": 2, "perceivedObjects": ours})
     codec = pycrate.PerceivedObjectContainer
     codec.set_val({"numberOfPerceivedObjects": 2, "perceivedObjects": theirs})
     assert codec.to_uper() == data
     trailer = {"refPointId": 1, "hitchPointOffset": 2, "trailerWidth": 30, "hitchAngle": angle}
     vehicle = {"orientationAngle": {"value": 1, "confidence": 1}, "pitchAngle": angle, "trailerDataSet": [trailer]}
     pycrate.OriginatingVehicleContainer.set_val(vehicle)
-    assert pycrate.OriginatingVehicleContainer.to_uper() == encode_type("OriginatingVehicleContainer", vehicle)
+    assert pycrate.OriginatingVehicleContainer.to_uper() == CPM.encode("OriginatingVehicleContainer", vehicle)
 
 
 @pytest.mark.parametrize(
@@ -381,9 +376,9 @@ def test_polar_velocity_of_others_is_read() -> None:
 
 
 def test_containers_we_do_not_know_are_skipped() -> None:
-    whole = decode_type("CollectivePerceptionMessage", encode(message()))
+    whole = CPM.decode("CollectivePerceptionMessage", encode(message()))
     whole["payload"]["cpmContainers"].append({"containerId": 4, "containerData": b"\x01\x02\x03"})
-    assert len(decode(encode_type("CollectivePerceptionMessage", whole)).boxes) == 2
+    assert len(decode(CPM.encode("CollectivePerceptionMessage", whole)).boxes) == 2
 
 
 def test_object_message_and_back() -> None:
@@ -480,10 +475,10 @@ def test_damaged_messages_decode_or_raise_message_error(
     ],
 )
 def test_message_of_another_kind_is_refused(change: Callable[[Any], None], expected: str) -> None:
-    whole = decode_type("CollectivePerceptionMessage", encode(message()))
+    whole = CPM.decode("CollectivePerceptionMessage", encode(message()))
     change(whole)
     with pytest.raises(MessageError, match=expected):
-        decode(encode_type("CollectivePerceptionMessage", whole))
+        decode(CPM.encode("CollectivePerceptionMessage", whole))
 
 
 def test_two_objects_with_one_id_are_refused() -> None:
@@ -501,21 +496,21 @@ def test_what_is_not_bytes_is_a_message_error(data: Any) -> None:
 
 
 def _containers(data: bytes) -> dict[str, Any]:
-    whole = decode_type("CollectivePerceptionMessage", data)
+    whole = CPM.decode("CollectivePerceptionMessage", data)
     return {
-        CONTAINERS[c["containerId"]]: decode_type(CONTAINERS[c["containerId"]], c["containerData"])
+        CONTAINERS[c["containerId"]]: CPM.decode(CONTAINERS[c["containerId"]], c["containerData"])
         for c in whole["payload"]["cpmContainers"]
     }
 
 
 def _message(containers: dict[str, Any]) -> bytes:
     """The bytes of `message()` with these containers."""
-    whole = decode_type("CollectivePerceptionMessage", encode(message()))
+    whole = CPM.decode("CollectivePerceptionMessage", encode(message()))
     numbers = {name: number for number, name in CONTAINERS.items()}
     whole["payload"]["cpmContainers"] = [
-        {"containerId": numbers[name], "containerData": encode_type(name, value)} for name, value in containers.items()
+        {"containerId": numbers[name], "containerData": CPM.encode(name, value)} for name, value in containers.items()
     ]
-    return encode_type("CollectivePerceptionMessage", whole)
+    return CPM.encode("CollectivePerceptionMessage", whole)
 
 
 def _decodes_or_is_refused(data: bytes) -> None:

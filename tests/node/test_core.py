@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cobevglue import Boxes
-from cobevglue.messages import MessageError, ObjectMessage, cpm, decode, encode
+from cobevglue.messages import MessageError, ObjectMessage, cpm, decode, encode, sdsm
 from cobevglue.node import NodeCore, NodeSettings, Outgoing, OwnList, SessionHeader, encode_header
 from cobevglue.tracking import Sort
 
@@ -267,16 +267,20 @@ def test_agents_are_bounded() -> None:
     assert len(core.metrics.text().splitlines()) < 100
 
 
-def test_cpm_without_header_is_aligned() -> None:
+@pytest.mark.parametrize("kind", ["cpm", "sdsm"])
+def test_standard_message_without_header_is_aligned(kind: str) -> None:
     drive, tracker = Drive(), Sort()
 
-    def as_cpm(sent: Outgoing) -> Iterable[tuple[bytes, None]]:
+    def as_standard(sent: Outgoing) -> Iterable[tuple[bytes, None]]:
         message = replace(decode(sent.data), agent_id="42", body=None)
         tracked = tracker.update(message.boxes.replace(track_id=None), message.time)
-        data = cpm.encode(cpm.CollectivePerception(42, message.time, tracked))
+        if kind == "cpm":
+            data = cpm.encode(cpm.CollectivePerception(42, message.time, tracked))
+        else:
+            data = sdsm.encode(sdsm.SensorDataSharing(42, message.time, tracked))
         return [(data, None), (data, None)]
 
-    result = drive.run(20, as_cpm)
+    result = drive.run(20, as_standard)
     assert result.alignments["42"].accepted
     assert drive.refused == ["", "duplicate"] * 20
 

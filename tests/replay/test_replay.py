@@ -180,12 +180,24 @@ def test_cpm_in_packets(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.seen.lists["42"].center[:, :2], [[5, 5]], atol=0.02)
 
 
+def test_sdsm_bytes_are_read(tmp_path: Path) -> None:
+    pytest.importorskip("asn1tools", reason="SDSMs need asn1tools")
+    from cobevglue.messages import sdsm
+
+    boxes = Boxes([(5, 5, 0)], [(4.5, 1.9, 1.5)], [0.0], track_id=[3])
+    data = sdsm.encode(sdsm.SensorDataSharing(station_id=42, time=100.0, boxes=boxes))
+    sent = ("/sdsm", BYTES, 0.9, {"data": np.frombuffer(data, np.uint8)})
+    with replay(tmp_path, lists(A, 1.0), [sent], others=["/sdsm"]) as made:
+        (frame,) = run(made)
+    np.testing.assert_allclose(frame.seen.lists["42"].center[:, :2], [[5, 5]], atol=0.051)
+
+
 def test_damaged_message_is_named(tmp_path: Path) -> None:
     pytest.importorskip("asn1tools", reason="CPMs need asn1tools")
     broken = ("/air", BYTES, 0.9, {"data": np.arange(20)})
     with (
         replay(tmp_path, lists(A, 1.0), [broken], others=["/air"]) as made,
-        pytest.raises(ValueError, match=r"/air: message 1 .*neither a CPM nor a message of cobevglue"),
+        pytest.raises(ValueError, match=r"/air: message 1 .*neither a CPM, an SDSM nor a message of cobevglue"),
     ):
         run(made)
 

@@ -1,6 +1,7 @@
 """Messages between agents: the object message and arrays in bytes, and the object list as a JSON file.
 
-`cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message.
+`cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message,
+`cobevglue.messages.sdsm` is SAE's Sensor Data Sharing Message.
 """
 
 from cobevglue.messages.array_message import Arrays, decode_arrays, encode_arrays

@@ -42,13 +42,13 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from cobevglue.boxes import Boxes, covers_origin
-from cobevglue.messages.cpm_objects import Columns, objects_from_columns, read_objects
-from cobevglue.messages.cpm_schema import decode_type, encode_type, has_spare_bytes
+from cobevglue.boxes import Boxes
+from cobevglue.messages.asn1_codec import CPM
+from cobevglue.messages.columns import Columns
+from cobevglue.messages.cpm_objects import objects_from_columns, read_objects
+from cobevglue.messages.fields import check_range, check_station_id, column, sent_ids, station_id_of, whole_bytes
 from cobevglue.messages.object_message import MessageError, ObjectMessage
-from cobevglue.typing import ArrayLike, FloatArray
+from cobevglue.typing import FloatArray
 
 __all__ = ["MAX_OBJECTS", "OWN_VEHICLE", "SENSOR_TYPES", "CollectivePerception", "decode", "encode"]
 
@@ -113,15 +113,13 @@ class CollectivePerception:
     omitted: int = 0
 
     def __post_init__(self) -> None:
-        if isinstance(self.station_id, bool) or not isinstance(self.station_id, (int, np.integer)):
-            raise MessageError(f"station_id must be a whole number, got {self.station_id!r}")
-        _check_range("station_id", self.station_id, 0, 2**32 - 1)
-        _check_range("time", self.time, 0.0, _MAX_TIME)
+        check_station_id(self.station_id)
+        check_range("time", self.time, 0.0, _MAX_TIME)
         for name, limit in (("latitude", 90.0), ("longitude", 180.0), ("heading", math.inf)):
             if getattr(self, name) is not None:
-                _check_range(name, getattr(self, name), -limit, limit)
+                check_range(name, getattr(self, name), -limit, limit)
         if self.altitude is not None:
-            _check_range("altitude", self.altitude, -1000.0, 8000.0)
+            check_range("altitude", self.altitude, -1000.0, 8000.0)
         if not isinstance(self.boxes, Boxes):
             raise MessageError(f"boxes must be Boxes, got {type(self.boxes).__name__}")
         if self.body is not None and (not isinstance(self.body, Boxes) or len(self.body) != 1):
@@ -138,7 +136,7 @@ class CollectivePerception:
             ("position_std", (n,)),
             ("yaw_std", (n,)),
         ):
-            object.__setattr__(self, name, _column(name, getattr(self, name), shape))
+            object.__setattr__(self, name, column(name, getattr(self, name), shape))
 
     @property
     def agent_id(self) -> str:
@@ -157,9 +155,7 @@ class CollectivePerception:
             MessageError: the agent id is not a number, or a field is outside of its limits.
         """
         if "station_id" not in fields:
-            if not (message.agent_id.isascii() and message.agent_id.isdigit()):
-                raise MessageError(f"agent_id must be a station id, 0 to 2^32 - 1, got {message.agent_id!r}")
-            fields["station_id"] = int(message.agent_id)
+            fields["station_id"] = station_id_of(message)
         return cls(time=message.time, boxes=message.boxes, body=message.body, **fields)
 
     def object_message(self, frame: int = 0) -> ObjectMessage:
@@ -179,15 +175,15 @@ def encode(message: CollectivePerception) -> bytes:
         raise MessageError("heading: a roadside unit must know it, since its CPM cannot say that it is unknown")
     angle, orientation = _sent_heading(message)
     objects = objects_from_columns(_columns(message), angle)
-    containers = [(_ROADSIDE, encode_type("OriginatingRsuContainer", {}))]
+    containers = [(_ROADSIDE, CPM.encode("OriginatingRsuContainer", {}))]
     if not message.is_infrastructure:
         container = {"orientationAngle": {"value": orientation, "confidence": 127}}
-        containers = [(_VEHICLE, encode_type("OriginatingVehicleContainer", container))]
+        containers = [(_VEHICLE, CPM.encode("OriginatingVehicleContainer", container))]
     if message.sensor_type is not None:
         sensor = {"sensorId": 1, "sensorType": SENSOR_TYPES.index(message.sensor_type), "shadowingApplies": False}
-        containers.append((_SENSORS, encode_type("SensorInformationContainer", [sensor])))
+        containers.append((_SENSORS, CPM.encode("SensorInformationContainer", [sensor])))
     perceived = {"numberOfPerceivedObjects": len(objects), "perceivedObjects": objects}
-    containers.append((_OBJECTS, encode_type("PerceivedObjectContainer", perceived)))
+    containers.append((_OBJECTS, CPM.encode("PerceivedObjectContainer", perceived)))
     payload = {
         "managementContainer": {
             "referenceTime": round(1000.0 * message.time),
@@ -196,7 +192,7 @@ def encode(message: CollectivePerception) -> bytes:
         "cpmContainers": [{"containerId": number, "containerData": data} for number, data in containers],
     }
     header = {"protocolVersion": _PROTOCOL_VERSION, "messageId": _CPM, "stationId": int(message.station_id)}
-    return encode_type("CollectivePerceptionMessage", {"header": header, "payload": payload})
+    return CPM.encode("CollectivePerceptionMessage", {"header": header, "payload": payload})
 
 
 def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
@@ -208,11 +204,9 @@ def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
         MessageError: these are not exactly one CPM with valid boxes; it says why.
         ModuleNotFoundError: asn1tools is not installed.
     """
-    if not isinstance(data, (bytes, bytearray, memoryview)):
-        raise MessageError(f"a message is bytes, got {type(data).__name__}")
-    data = bytes(data)
-    whole = decode_type("CollectivePerceptionMessage", data)
-    if has_spare_bytes("CollectivePerceptionMessage", data):
+    data = whole_bytes(data)
+    whole = CPM.decode("CollectivePerceptionMessage", data)
+    if CPM.has_spare_bytes("CollectivePerceptionMessage", data):
         raise MessageError(f"oversized: {len(data)} bytes, the CPM ends before")
     header, payload = whole["header"], whole["payload"]
     if (header["protocolVersion"], header["messageId"]) != (_PROTOCOL_VERSION, _CPM):
@@ -232,12 +226,12 @@ def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
         heading = _received_heading(containers.get(_VEHICLE))
     objects = []
     if _OBJECTS in containers:
-        objects = decode_type("PerceivedObjectContainer", containers[_OBJECTS])["perceivedObjects"]
+        objects = CPM.decode("PerceivedObjectContainer", containers[_OBJECTS])["perceivedObjects"]
     try:
         columns, omitted = read_objects(objects, heading or 0.0)
     except ValueError as error:
         raise MessageError(f"invalid boxes: {error}") from None
-    columns, body = _split_body(columns)
+    columns, body = columns.split_own_vehicle(OWN_VEHICLE)
     management = payload["managementContainer"]
     position = management["referencePosition"]
     return CollectivePerception(
@@ -273,7 +267,7 @@ def _sent_heading(message: CollectivePerception) -> tuple[float, int]:
 def _received_heading(vehicle: bytes | None) -> float | None:
     if vehicle is None:
         return None
-    orientation = decode_type("OriginatingVehicleContainer", vehicle)["orientationAngle"]["value"]
+    orientation = CPM.decode("OriginatingVehicleContainer", vehicle)["orientationAngle"]["value"]
     return None if orientation == _NO_ANGLE else _heading_of(orientation)
 
 
@@ -305,12 +299,7 @@ def _columns(message: CollectivePerception) -> Columns:
     boxes = message.boxes
     if len(boxes) and boxes.track_id is None:
         raise MessageError("boxes must have a track_id, since the standard requires objectId: use a tracker")
-    ids = np.zeros(0, np.int64) if boxes.track_id is None else boxes.track_id
-    if (ids < 0).any():
-        raise MessageError(f"track_id: row {int((ids < 0).argmax())} is {int(ids.min())}, ids must be >= 0")
-    ids = ids % OWN_VEHICLE
-    if len(np.unique(ids)) < len(ids):
-        raise MessageError(f"track_id: two ids are the same modulo {OWN_VEHICLE}")
+    ids = sent_ids(boxes, OWN_VEHICLE)
     columns = Columns(
         boxes.replace(track_id=ids),
         message.velocity,
@@ -321,44 +310,8 @@ def _columns(message: CollectivePerception) -> Columns:
     )
     if message.body is None:
         return columns
-    if not covers_origin(message.body)[0]:
-        raise MessageError("body must stand on the origin of the frame, the reference position")
     return columns.with_own_vehicle(message.body, OWN_VEHICLE)
-
-
-def _split_body(columns: Columns) -> tuple[Columns, Boxes | None]:
-    """Separate the own vehicle: the object with its id, if it stands on the reference position."""
-    ids = columns.boxes.track_id
-    if ids is None:
-        return columns, None
-    own = (ids == OWN_VEHICLE) & covers_origin(columns.boxes)
-    if not own.any():
-        return columns, None
-    body = columns.boxes[own]
-    return columns[~own], Boxes(body.center, body.size, body.yaw)
 
 
 def _known(value: int, unavailable: int, unit: float) -> float | None:
     return None if value == unavailable else value * unit
-
-
-def _check_range(name: str, value: Any, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
-        raise MessageError(f"{name} must be a finite number, got {value!r}")
-    if not low <= value <= high:
-        raise MessageError(f"{name} must be from {low} to {high}, got {value}")
-
-
-def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray | None:
-    if values is None:
-        return None
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise MessageError(f"{name} must be numbers of shape {shape}: {error}") from None
-    if array.size == 0 and shape[0] == 0:
-        array = array.reshape(shape)
-    if array.shape != shape:
-        raise MessageError(f"{name} must have shape {shape}, got {array.shape}")
-    array.setflags(write=False)
-    return array

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from cobevglue.boxes import Boxes
+from cobevglue.messages.columns import Columns
+from cobevglue.messages.fields import rounded, whole_units
 from cobevglue.messages.object_message import MessageError
 from cobevglue.se2 import SE2, wrap_angle
-from cobevglue.typing import BoolArray, FloatArray, IntArray
+from cobevglue.typing import FloatArray, IntArray
 
-__all__ = ["Columns", "objects_from_columns", "read_objects"]
+__all__ = ["objects_from_columns", "read_objects"]
 
 _CENTIMETRE, _DECIMETRE, _TENTH_OF_DEGREE, _MILLISECOND = 0.01, 0.1, math.radians(0.1), 0.001
 _MAX_COORDINATE, _MAX_SPEED, _MAX_SIZE, _MAX_AGE, _MAX_OFFSET = 131070, 16381, 255, 1500, 2046
@@ -43,42 +44,6 @@ _ROAD_USERS = {
 _SYNONYMS = {"bicycle": "cyclist", "bicyclist": "cyclist", "motorcyclist": "motorcycle", "person": "pedestrian"}
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Boxes and what a CPM says of them beside; see `CollectivePerception`."""
-
-    boxes: Boxes
-    velocity: FloatArray | None = None
-    age: FloatArray | None = None
-    measurement_offset: FloatArray | None = None
-    position_std: FloatArray | None = None
-    yaw_std: FloatArray | None = None
-
-    def __getitem__(self, rows: BoolArray) -> Columns:
-        """The rows that a mask selects."""
-        columns: dict[str, Any] = {}
-        for field in fields(self):
-            values = getattr(self, field.name)
-            columns[field.name] = None if values is None else values[rows]
-        return Columns(**columns)
-
-    def with_own_vehicle(self, body: Boxes, object_id: int) -> Columns:
-        """These rows and one more: the sender's vehicle, of which nothing but the box is known."""
-        boxes = self.boxes
-        row = body.replace(
-            score=None if boxes.score is None else [0.0],
-            track_id=[object_id],
-            label=None if boxes.label is None else ["unknown"],
-        )
-        columns: dict[str, Any] = {"boxes": Boxes.concatenate([boxes, row])}
-        for field in fields(self)[1:]:
-            values = getattr(self, field.name)
-            if values is not None:
-                unknown = 0.0 if field.name == "measurement_offset" else math.nan
-                columns[field.name] = np.concatenate([values, np.full((1, *values.shape[1:]), unknown)])
-        return Columns(**columns)
-
-
 def objects_from_columns(columns: Columns, heading: float) -> list[dict[str, Any]]:
     """The `PerceivedObject`s, in the form that asn1tools takes.
 
@@ -90,14 +55,14 @@ def objects_from_columns(columns: Columns, heading: float) -> list[dict[str, Any
         MessageError: a value is out of its range; it names field and row.
     """
     boxes = columns.boxes.transform(SE2(0.0, 0.0, heading))
-    centers = _units("center (east, north, up)", boxes.center, _CENTIMETRE, _MAX_COORDINATE)
-    sizes = np.clip(_rounded(boxes.size / _DECIMETRE), 1, _MAX_SIZE)
-    angles = _rounded(boxes.yaw / _TENTH_OF_DEGREE) % 3600
+    centers = whole_units("center (east, north, up)", boxes.center, _CENTIMETRE, _MAX_COORDINATE, "a CPM")
+    sizes = np.clip(rounded(boxes.size / _DECIMETRE), 1, _MAX_SIZE)
+    angles = rounded(boxes.yaw / _TENTH_OF_DEGREE) % 3600
     coordinate_confidence = _confidences(columns.position_std, len(boxes), _CENTIMETRE, 4095, _NO_COORDINATE_CONFIDENCE)
     angle_confidence = _confidences(columns.yaw_std, len(boxes), _TENTH_OF_DEGREE, 126, _NO_ANGLE_CONFIDENCE)
     offsets = np.zeros(len(boxes), np.int64)
     if columns.measurement_offset is not None:
-        offsets = _units("measurement_offset", columns.measurement_offset, _MILLISECOND, _MAX_OFFSET)
+        offsets = whole_units("measurement_offset", columns.measurement_offset, _MILLISECOND, _MAX_OFFSET, "a CPM")
     assert boxes.track_id is not None
     objects = []
     for row, (center, size) in enumerate(zip(centers.tolist(), sizes.tolist(), strict=True)):
@@ -177,7 +142,7 @@ def _add_velocities(objects: list[dict[str, Any]], velocity: FloatArray | None, 
         return
     turned = velocity @ SE2(0.0, 0.0, heading).rotation.T
     known = ~np.isnan(turned[:, 0] + turned[:, 1])
-    units = _units("velocity", np.where(known[:, None], turned, 0.0), _CENTIMETRE, _MAX_SPEED)
+    units = whole_units("velocity", np.where(known[:, None], turned, 0.0), _CENTIMETRE, _MAX_SPEED, "a CPM")
     for item, (x, y), is_known in zip(objects, units.tolist(), known.tolist(), strict=True):
         if is_known:
             item["velocity"] = (
@@ -208,21 +173,6 @@ def _add_scores(objects: list[dict[str, Any]], score: FloatArray | None) -> None
         raise MessageError(f"score: row {row} is {score[row]}, a CPM holds scores from 0 to 1: leave them out")
     for item, value in zip(objects, score.tolist(), strict=True):
         item["objectPerceptionQuality"] = round(15.0 * value)
-
-
-def _units(name: str, values: FloatArray, unit: float, limit: int) -> IntArray:
-    """Whole units; MessageError if one is beyond the limit."""
-    units = _rounded(np.clip(values / unit, -2.0 * limit, 2.0 * limit))
-    beyond = ~np.isfinite(values) | (np.abs(units) > limit)
-    if beyond.any():
-        row = int(beyond.reshape(len(values), -1).any(axis=1).argmax())
-        raise MessageError(f"{name}: row {row} is {values[row].tolist()}, a CPM holds at most {limit * unit:g}")
-    return units
-
-
-def _rounded(values: FloatArray) -> IntArray:
-    units: IntArray = np.nan_to_num(np.rint(values)).astype(np.int64)
-    return units
 
 
 def _confidences(std: FloatArray | None, n: int, unit: float, out_of_range: int, unavailable: int) -> IntArray:

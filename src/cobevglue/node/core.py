@@ -56,7 +56,8 @@ _OWN_CLOCK_SET = 1.0  # an own list so much older than the last one is no stragg
 _FARTHEST, _LARGEST = 1e8, 100.0  # of a frame's origin, of an object's size [m]
 _MAX_SENDERS = 1024  # of which the last number is remembered
 _MAX_EVENTS = 100
-_COMPACT, _CPM = b"CBVG", b"\x02\x0e"  # how the formats begin; a CPM by its version and its message id
+# How the formats begin: a CPM by its version and its message id, an SDSM by the id in its frame.
+_COMPACT, _CPM, _SDSM = b"CBVG", b"\x02\x0e", b"\x00\x29"
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Count = Annotated[int, Field(ge=1)]
@@ -186,7 +187,7 @@ class NodeCore:
         """Take a message that arrived.
 
         Args:
-            data: an object message or a CPM.
+            data: an object message, a CPM or an SDSM.
             now: when it arrived [s].
             header: the session header beside it; None if there was none.
 
@@ -365,17 +366,21 @@ def warm_up() -> None:
 
 
 def _decode(data: bytes) -> ObjectMessage:
-    """The object message, or the CPM as one.
+    """The object message, or the CPM or SDSM as one.
 
     Raises:
         UnknownVersionError: an object message of a newer version.
-        MessageError: neither.
-        ModuleNotFoundError: a CPM, and its decoder is not installed.
+        MessageError: none of them.
+        ModuleNotFoundError: a CPM or SDSM, and its decoder is not installed.
     """
     if data[: len(_CPM)] == _CPM:
         from cobevglue.messages import cpm
 
         return cpm.decode(data).object_message()
+    if data[: len(_SDSM)] == _SDSM:
+        from cobevglue.messages import sdsm
+
+        return sdsm.decode(data).object_message()
     if data[: len(_COMPACT)] == _COMPACT and len(data) > len(_COMPACT) and data[len(_COMPACT)] > VERSION:
         raise UnknownVersionError(
             f"object message of version {data[len(_COMPACT)]}, versions up to {VERSION} can be read"

@@ -28,6 +28,7 @@ _FARTHEST, _LARGEST = 10_000.0, 1_000.0
 """Of the objects that an agent can see: distance and size [m]; beyond, they are not in its frame, or damaged."""
 _CPM_PORT = (2009).to_bytes(2, "big")
 """Destination port of CPMs in the header of ETSI's basic transport protocol, which precedes them in packets."""
+_SDSM = b"\x00\x29"  # a MessageFrame with the id of an SDSM
 _OBJECT_MESSAGE = b"CBVG"
 
 
@@ -162,17 +163,18 @@ def is_elsewhere(frame: str, own_frame: str | None) -> bool:
 
 
 def _decoded(data: bytes) -> ObjectMessage:
-    """The object message in these bytes, or that of the CPM in them, with or without the header of its transport."""
+    """The object message in these bytes, or that of the SDSM or CPM in them, a CPM also behind its transport header."""
     if data.startswith(_OBJECT_MESSAGE):
         return decode(data)
-    from cobevglue.messages import cpm
+    from cobevglue.messages import cpm, sdsm
 
     if data.startswith(_CPM_PORT):
         data = data[4:]
     try:
-        return cpm.decode(data).object_message()
+        message = sdsm.decode(data) if data.startswith(_SDSM) else cpm.decode(data)
+        return message.object_message()
     except MessageError as error:
-        raise MessageError(f"neither a CPM nor a message of cobevglue: {error}") from None
+        raise MessageError(f"neither a CPM, an SDSM nor a message of cobevglue: {error}") from None
 
 
 def _check_boxes(boxes: Boxes) -> None:
