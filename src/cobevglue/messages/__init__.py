@@ -1,6 +1,6 @@
-"""Messages between agents: the object message and arrays in bytes, and the object list as a JSON file.
+"""Messages between agents: object messages and array messages as bytes, and object lists as JSON files.
 
-`cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message.
+`cobevglue.messages.cpm` implements ETSI's Collective Perception Message, an alternative to the object message.
 """
 
 from cobevglue.messages.array_message import Arrays, decode_arrays, encode_arrays

@@ -1,6 +1,6 @@
-"""Encoding and decoding of the types in `cpm.asn`, unaligned PER, by asn1tools.
+"""Encoding and decoding of the types in `cpm.asn` in unaligned PER, with asn1tools.
 
-Needs: pip install 'cobevglue[cpm]'
+Requires: pip install 'cobevglue[cpm]'
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ SCHEMA = Path(__file__).with_name("cpm.asn")
 
 
 def encode_type(name: str, value: Any) -> bytes:
-    """Encode a value of the type of this name.
+    """Encode a value of an ASN.1 type.
 
     Args:
-        name: of the type.
-        value: nested dicts, lists, (name, value) for a choice, and so on, as asn1tools takes them.
+        name: name of the type.
+        value: the value in asn1tools' representation: nested dicts, lists, (name, value) for a choice, and so on.
 
     Raises:
-        MessageError: the value is not one of the type.
+        MessageError: the value is not valid for the type.
     """
     asn1tools = _asn1tools()
     try:
@@ -36,7 +36,7 @@ def encode_type(name: str, value: Any) -> bytes:
 
 
 def decode_type(name: str, data: bytes) -> Any:
-    """Decode a value of the type of this name; bytes behind it are ignored.
+    """Decode a value of the named ASN.1 type. Bytes after the value are ignored.
 
     Raises:
         MessageError: the bytes do not start with the encoding of a value of the type.
@@ -44,14 +44,14 @@ def decode_type(name: str, data: bytes) -> Any:
     codec = _specification()
     try:
         return codec.decode(name, data)
-    except Exception as error:  # asn1tools raises whatever its own code runs into: IndexError, KeyError, OverflowError
+    except Exception as error:  # on invalid bytes asn1tools also raises IndexError, KeyError, OverflowError and others
         raise MessageError(f"not a {name}: {type(error).__name__}: {error}") from None
 
 
 def has_spare_bytes(name: str, data: bytes) -> bool:
-    """Whether bytes follow the encoding of a value of this type, which `decode_type` accepts.
+    """Return whether further bytes follow the encoded value, which `decode_type` ignores.
 
-    The last byte of an encoding holds at least one bit of it, so without that byte it cannot be decoded.
+    The last byte of an encoding contains at least one bit of the value, so without it decoding fails.
     """
     try:
         decode_type(name, data[:-1])
