@@ -152,7 +152,7 @@ def highway(rng: np.random.Generator, variant: int) -> Plan:
     turned, curvature, median = rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1) / 900, rng.uniform(1.5, 4.0)
     reach = _EXTENT + 30.0
     ahead = _line(0.0, reach, turned, curvature)
-    # Left of the middle line of the road, so that the two halves meet in the centre with one direction.
+    # Left of the road's centre line, so that the two halves have the same direction at the centre.
     behind = _line(0.0, reach, turned + math.pi, -curvature)
     middle = np.vstack([behind[:0:-1], ahead])
     for side, line in (("a", middle), ("b", middle[::-1])):

@@ -4,9 +4,9 @@
     PYTHONPATH=benchmarks python -m peers.search CBM VIPS
 
 Data: V2V4Real train 0000 to 0005 (`v2v4real_sequences`, seed 0), every fifth frame with at least two co-visible
-objects, independently of the other frames. Criterion: share of right frames minus three times the share of wrong frames. The
-first row is the published settings, followed by the best of 60 draws, for which each setting is drawn independently
-from its choices in `SPACES`. The best settings of all are the defaults of the classes.
+objects, independently of the other frames. Criterion: share of right frames minus three times the share of wrong
+frames. The first row is the published settings, followed by the best of 60 draws, for which each setting is drawn
+independently from its choices in `SPACES`. The best settings of all are the defaults of the classes.
 """
 
 from __future__ import annotations
