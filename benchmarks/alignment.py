@@ -1,4 +1,4 @@
-"""How often BEVGlue finds two agents' relative pose, how often it is wrong, and what each of its options is worth.
+"""Measure BEVGlue's success and error rates for the relative pose of two agents, with an ablation of its options.
 
     python benchmarks/alignment.py                      # everything below, about 15 minutes
     python benchmarks/alignment.py --only v2v4real      # recorded detections of two real cars

@@ -50,7 +50,7 @@ class PrincipalComponents(CompressedFusion):
         self.bases = bases
 
     def message(self, observation: PerceptionOutput) -> Arrays:
-        """The components in place of the channels."""
+        """Encode the principal components in place of the channels."""
         maps = {
             name: np.einsum("ck,chw->khw", basis, values.astype(np.float32) - mean[:, None, None]).astype(np.float16)
             for (name, values), (mean, basis) in zip(self.method.message(observation).items(), self.bases, strict=True)
@@ -73,7 +73,7 @@ class PrincipalComponents(CompressedFusion):
 
 
 def observed(models: Models, split: str, seed: int, sequences: int, frames: int) -> Iterator[ObservedSequence]:
-    """Every fifth frame of sequences, seen by all agents."""
+    """Return every fifth frame of the sequences with the observations of all agents."""
     settings = StudySettings(split=split, seed=seed, frames=EVERY * frames)
     for number in range(sequences):
         sequence = ObservedSequence(models.detector)

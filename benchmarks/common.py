@@ -1,4 +1,4 @@
-"""What the benchmarks share: the head of their output and the folder of third-party data."""
+"""Shared by the benchmarks: the header of their output and the folder of third-party data."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ DATA = Path(os.environ.get("COBEVGLUE_DATA", Path(__file__).parents[2] / "shared
 
 
 def print_head(*facts: str) -> None:
-    """Print the command, the date, the machine, and facts such as the seed."""
+    """Print the command, the date, the machine and further facts, such as the seed."""
     print(f"$ python {' '.join(sys.argv)}\n\n{', '.join([time.strftime('%Y-%m-%d'), machine(), *facts])}\n")
 
 
 def machine() -> str:
-    """The processor, Python and NumPy that run this."""
+    """Return processor, number of cores, and versions of Python and NumPy."""
     cpu = platform.machine()
     if Path("/proc/cpuinfo").exists():
         cpu = next(iter(re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())), cpu)

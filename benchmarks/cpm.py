@@ -136,7 +136,7 @@ def random_boxes(n: int) -> Boxes:
 
 
 def perception(boxes: Boxes, **fields: Any) -> cpm.CollectivePerception:
-    """A CPM of a car that knows where it is."""
+    """Return the CPM of a car with known position and heading."""
     return cpm.CollectivePerception(
         7, 12.5, boxes, heading=0.3, latitude=48.1, longitude=11.5, altitude=500.0, **fields
     )
@@ -193,7 +193,7 @@ def spread(runs: list[list[Record]]) -> dict[str, Any]:
 
 
 def jitter(seed: int) -> Channel:
-    """Positions off by 1 micrometre: how far results depend on nothing."""
+    """Shift positions by 1 micrometre, to measure the sensitivity to negligible changes."""
     rng = np.random.default_rng([seed, 2])
 
     def channel(frame: PairFrame) -> Received:
@@ -258,7 +258,7 @@ def sent(sequence: AlignmentSequence, channel: Channel) -> AlignmentSequence:
 
 
 def draw(path: Path) -> None:
-    """Bytes by number of boxes, and how far boxes arrive from where they were."""
+    """Draw bytes by number of boxes, and the position error after encoding and decoding."""
     counts = range(0, 61, 2)
     lists = [random_boxes(n) for n in counts]
     figure = new_figure(9.0, 3.6)

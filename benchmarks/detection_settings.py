@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def frame(cloud: Cloud, output: HeadOutput, detector: PointPillars) -> DetectionFrame:
-    """What the detector's settings make of its network's output."""
+    """Decode the network's output with these detection settings."""
     assert cloud.points is not None
     (found,) = detector.boxes(output)
     boxes = detector.refine_headings(found, cloud.points).boxes

@@ -1,4 +1,4 @@
-"""Damaged messages, by the million: no crash, and no box that is silently wrong.
+"""Fuzz test of both message formats: decoding must not crash or return silently wrong boxes.
 
     python benchmarks/fuzz_messages.py                       # one minute
     python benchmarks/fuzz_messages.py --messages 10000000   # for an hour or two
@@ -87,7 +87,7 @@ class Report:
 
 
 def main() -> None:
-    """Damage messages until the time or their number is up."""
+    """Fuzz until the time limit or the number of messages is reached."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0, help="for all formats together")
     parser.add_argument("--messages", type=int, help="so many instead, the same number of each format")
@@ -193,13 +193,13 @@ def damaged(data: bytes, others: list[bytes], rng: np.random.Generator, kinds: t
 
 
 def check_object_message(data: bytes, known: frozenset[bytes], repaired: bool, report: Report) -> None:
-    """An object message is refused, or it is what its bytes say and has a valid checksum."""
+    """Check that an object message is rejected, or has a valid checksum and is decoded correctly."""
     try:
         message = decode(data)
     except MessageError as error:
         report.refuse(error)
         return
-    except Exception as error:  # anything else is what we look for
+    except Exception as error:  # any other exception is a failure
         report.fail(f"{type(error).__name__}: {error}", data)
         return
     report.accepted += 1
@@ -239,7 +239,7 @@ def check_standard_message(name: str, data: bytes, _known: frozenset[bytes], _re
 
 
 def check_header(original: bytes, data: bytes, report: Report) -> None:
-    """The session header of the original message refuses any other."""
+    """Check that the session header of the original message rejects any other message."""
     header = encode_header(SessionHeader(1, 1), original)
     try:
         decode_header(header, data)

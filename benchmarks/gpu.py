@@ -1,4 +1,4 @@
-"""What a GPU makes of the detectors: `python benchmarks/gpu.py`.
+"""Speed of the detectors on a GPU, and agreement with the CPU: `python benchmarks/gpu.py`.
 
 Times are medians over simulated clouds of the validation split, one cloud at a time as a vehicle has them, and eight at
 once; a step of training is forward, backward and optimiser. Boxes found on the GPU are compared with those on the CPU.
@@ -91,7 +91,7 @@ def speed(detector: PointPillars, clouds: list[np.ndarray], repeats: int) -> Non
 
 
 def training(model: str, batch: int, device: torch.device, repeats: int) -> None:
-    """Samples a second, when nobody waits for clouds."""
+    """Measure training throughput [samples/s] without data loading."""
     config = PRESETS[model]
     ready = Batches(config.model, config.data.min_points, config.augmentation)
     random = np.random.default_rng(0)

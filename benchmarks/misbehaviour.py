@@ -131,7 +131,7 @@ def honest(drive: list[PairFrame], i: int, rng: np.random.Generator) -> Boxes:
 
 
 def invent(count: int) -> Tamper:
-    """Cars that are not there drive along with the other agent."""
+    """Add fabricated cars that move with the other agent."""
 
     def tamper(drive: list[PairFrame], i: int, rng: np.random.Generator) -> Boxes:
         distance, bearing = REACH * np.sqrt(rng.uniform(0.05, 1.0, count)), rng.uniform(-math.pi, math.pi, count)
@@ -158,7 +158,7 @@ def chosen(drive: list[PairFrame], share: float, rng: np.random.Generator) -> se
 
 
 def remove(share: float) -> Tamper:
-    """A share of the objects is left out."""
+    """Remove a share of the objects."""
 
     def tamper(drive: list[PairFrame], i: int, rng: np.random.Generator) -> Boxes:
         some, other = chosen(drive, share, rng), drive[i].other

@@ -99,7 +99,7 @@ def back_and_forth(seed: int) -> list[ObjectListFrame]:
 
 @dataclass
 class AgentProcess:
-    """A `cobevglue node` and what is known of it."""
+    """A `cobevglue node` process and its state."""
 
     name: str
     port: int
@@ -139,7 +139,7 @@ class AgentProcess:
         self.process = None
 
     def is_ready(self) -> bool:
-        """Whether it answers."""
+        """Return whether the process answers requests for its metrics."""
         return bool(self.metrics())
 
     def prioritise(self) -> None:
@@ -313,7 +313,7 @@ def accepted(results: list[tuple[float, dict[str, Any]]]) -> dict[str, str]:
 
 
 def undisturbed(seed: int) -> dict[frozenset[str], BoolArray]:
-    """Of each pair, in which frames an aligner accepts that was never interrupted: some see too little in common."""
+    """Return, for each pair, the frames accepted by an uninterrupted aligner: some pairs share too few objects."""
     frames = back_and_forth(seed)
     trackers = {name: Sort() for name in AGENTS}
     aligners = {pair: BEVGlue() for pair in combinations(AGENTS, 2)}
@@ -388,7 +388,7 @@ def set_realtime(pid: int) -> None:
 
 
 def free_ports(number: int) -> list[int]:
-    """Ports that nobody listens at."""
+    """Return unused ports."""
     sockets = [socket.socket() for _ in range(number)]
     for each in sockets:
         each.bind(("127.0.0.1", 0))
@@ -439,7 +439,7 @@ class SimulatedSender:
 
 
 def time_lapse(frames: int, seed: int) -> dict[str, Any]:
-    """One node among seven senders, as fast as possible."""
+    """Run one node with seven senders as fast as possible."""
     warm_up()
     core = NodeCore("car1", 1)
     session, now, done = 1, 1e6, 0

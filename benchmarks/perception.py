@@ -1,4 +1,4 @@
-"""How well the shipped detector finds vehicles, in clouds it never saw, and what BEVGlue makes of its boxes.
+"""Evaluate the shipped detector on unseen clouds, and BEVGlue on its detections.
 
     python benchmarks/perception.py                    # everything below, about 10 minutes on two cores
     python benchmarks/perception.py --only real        # OPV2V clouds: average precision, headings, what is missed

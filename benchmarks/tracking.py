@@ -1,6 +1,6 @@
 """Quality and speed of the tracker on real detections: `python benchmarks/tracking.py`.
 
-Three sources, all in a frame that moves with a vehicle whose motion no tracker is told:
+Three sources, all in the frame of a moving vehicle; the trackers do not receive its motion:
 
 - KITTI tracking (PointRCNN cars, five sequences). A detection's similarity to a label is the BEV IoU of their boxes,
   0.5 for MOTA and IDF1. Only `Car` labels count. Detections on a Van (IoU 0.5), or unmatched and for more than half in
@@ -54,14 +54,14 @@ SAME_OBJECT = 2.0
 
 
 class Tracker(Protocol):
-    """What is compared."""
+    """Interface of the compared trackers."""
 
     def update(self, boxes: Boxes) -> Boxes:
         """The same boxes with `track_id`."""
 
 
 class NearestNeighbour:
-    """The plain way: each pair of a box and one of the frame before, nearest first, keeps the identity; no motion."""
+    """Baseline: greedy matching to the boxes of the previous frame, nearest pairs first, without a motion model."""
 
     def __init__(self, max_distance: float = 4.0) -> None:
         self.max_distance = max_distance

@@ -2,9 +2,9 @@
 
     pip install eclipse-sumo && python tools/build_networks.py
 
-Needed only to change the networks: the stored files run with libsumo alone. Each variant is written as plain nodes,
-edges and connections, and SUMO's netconvert makes lanes, junction areas, right of way and signal plans of them. The
-files are the same bytes every time for one version of netconvert.
+Required only to change the networks: simulation with the stored files needs only libsumo. Each variant is defined by
+nodes, edges and connections, from which SUMO's netconvert generates lanes, junction areas, right of way and signal
+plans. One version of netconvert always generates identical files.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ import numpy as np
 from cobevglue.simulation.road_network import NETWORK_KINDS, NETWORKS, NETWORKS_FOLDER
 from cobevglue.typing import FloatArray
 
-_EXTENT = 190.0  # how far roads reach from the centre [m]
+_EXTENT = 190.0  # distance from the centre to the end of the roads [m]
 _TOWN, _RESIDENTIAL, _HIGHWAY, _RAMP = 13.9, 8.3, 30.6, 19.4  # speed limits [m/s]
-_POINT_SPACING = 8.0  # between the points of curved roads [m]
+_POINT_SPACING = 8.0  # spacing of the points of curved roads [m]
 
 
 @dataclass
@@ -39,10 +39,10 @@ class Plan:
     edges: list[str] = field(default_factory=list)
     connections: list[str] = field(default_factory=list)
     last_part: dict[str, str] = field(default_factory=dict)
-    """What netconvert calls the last part of an edge that is split."""
+    """Return netconvert's name of the last part of a split edge."""
 
     def node(self, name: str, xy: FloatArray, **attributes: object) -> None:
-        """A place where roads begin, meet or end."""
+        """Add a node: a position where roads begin, meet or end."""
         self.nodes.append(_element("node", id=name, x=f"{xy[0]:.2f}", y=f"{xy[1]:.2f}", **attributes))
 
     def edge(
@@ -58,11 +58,11 @@ class Plan:
         pocket: int = 0,
         priority: int = 5,
     ) -> None:
-        """A directed road, perhaps of two edges: split so far before its end, or after its start if negative.
+        """Add a directed road, optionally split into two edges: before its end, or after its start if negative.
 
-        SUMO gives all lanes of one edge the same length. Where only a part of an edge bends, vehicles that change lanes
-        would therefore jump ahead or back; splitting it where the bend begins avoids that. `pocket` of the leftmost
-        lanes exist only after the split.
+        In SUMO all lanes of an edge have the same length. On an edge of which only a part is curved, vehicles that
+        change lanes would therefore jump forwards or backwards; splitting the edge where the curve begins avoids this.
+        The leftmost `pocket` lanes exist only after the split.
         """
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
         splits = ""
@@ -75,13 +75,13 @@ class Plan:
         self.edges.append(text[:-2] + ">" + splits + "</edge>" if splits else text)
 
     def connect(self, start: str, end: str, *lanes: tuple[int, int]) -> None:
-        """Which lane of one edge leads to which of the next."""
+        """Connect a lane of one edge to a lane of the next."""
         for a, b in lanes:
             self.connections.append(_element("connection", **{"from": start, "to": end, "fromLane": a, "toLane": b}))
 
 
 def junction(rng: np.random.Generator, variant: int) -> Plan:
-    """Four arms, signals, lanes for turning left on some of them."""
+    """Return a four-arm signalised junction with left-turn lanes on some arms."""
     plan = Plan()
     plan.node("c", np.zeros(2), type="traffic_light")
     angles = np.arange(4) * math.pi / 2 + rng.uniform(-0.3, 0.3, 4) + rng.uniform(0, math.pi / 2)
@@ -94,7 +94,7 @@ def junction(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def t_junction(rng: np.random.Generator, variant: int) -> Plan:
-    """A through road and a side road, with right of way or signals."""
+    """Return a junction of a through road and a side road, with priority or signals."""
     plan = Plan()
     plan.node("c", np.zeros(2), type="traffic_light" if variant % 2 else "priority")
     turned, width = rng.uniform(0, 2 * math.pi), rng.uniform(3.0, 3.6)
@@ -108,7 +108,7 @@ def t_junction(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def roundabout(rng: np.random.Generator, variant: int) -> Plan:
-    """A ring with three to five arms."""
+    """Return a roundabout with three to five arms."""
     plan = Plan()
     arms, ring_lanes = 3 + variant % 3, 1 + (variant // 2) % 2
     radius = float(rng.uniform(15, 20) + 3 * (arms - 3) + 8 * (ring_lanes - 1))
@@ -117,7 +117,7 @@ def roundabout(rng: np.random.Generator, variant: int) -> Plan:
     angles = np.arange(arms) * spread + rng.uniform(-0.14, 0.14, arms) * spread + rng.uniform(0, 2 * math.pi)
     half = (
         5.0 + 3.5 * ring_lanes
-    ) / radius  # from an arm's middle line to where its entry and exit meet the ring [rad]
+    ) / radius  # angle between an arm's centre line and its entry and exit at the ring [rad]
     on_ring = [
         (f"{kind}{arm}", angles[arm] + sign * half) for arm in range(arms) for kind, sign in (("x", -1), ("e", 1))
     ]
@@ -131,7 +131,7 @@ def roundabout(rng: np.random.Generator, variant: int) -> Plan:
         line = _line(radius + 6.0 + 10.0 * ring_lanes, _EXTENT, angle, rng.uniform(-0.003, 0.003))
         plan.node(f"n{arm}", line[-1])
         entry, exit_ = (radius * _unit(dict(on_ring)[f"{kind}{arm}"]) for kind in "ex")
-        # Both meet the ring partly along it, partly towards its centre.
+        # Entry and exit meet the ring at an oblique angle.
         flare_in = _bend(line[0], -_unit(angle), entry, _unit(angle + half + math.pi / 2) - 1.2 * _unit(angle + half))
         flare_out = _bend(exit_, _unit(angle - half + math.pi / 2) + 1.2 * _unit(angle - half), line[0], _unit(angle))
         plan.node(f"f{arm}", line[0])
@@ -146,13 +146,13 @@ def roundabout(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def highway(rng: np.random.Generator, variant: int) -> Plan:
-    """Two carriageways, each with an exit and an entry."""
+    """Return a motorway with two carriageways, each with an exit and an entry."""
     plan = Plan()
     lanes, width = 3 + variant % 2, rng.uniform(3.5, 3.75)
     turned, curvature, median = rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1) / 900, rng.uniform(1.5, 4.0)
     reach = _EXTENT + 30.0
     ahead = _line(0.0, reach, turned, curvature)
-    # Left of the middle line of the road, so that the two halves meet in the centre with one direction.
+    # Left of the road's centre line, so that the two halves have the same direction at the centre.
     behind = _line(0.0, reach, turned + math.pi, -curvature)
     middle = np.vstack([behind[:0:-1], ahead])
     for side, line in (("a", middle), ("b", middle[::-1])):
@@ -161,7 +161,7 @@ def highway(rng: np.random.Generator, variant: int) -> Plan:
         parts = _cut(line, cuts)
         plan.node(f"{side}5", line[-1])
         for index, part in enumerate(parts):
-            # From the entry on, and up to the exit, there is one lane more, on the right: the left one stays in place.
+            # Between entry and exit the carriageway has one additional lane on the right; the left lane is unchanged.
             plan.node(f"{side}{index}", part[0], type="priority")
             here, before = (lanes + (at in (1, 3)) for at in (index, index - 1))
             plan.edge(
@@ -188,7 +188,7 @@ def highway(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def residential(rng: np.random.Generator, variant: int) -> Plan:
-    """A narrow winding street with side streets."""
+    """Return a narrow winding street with side streets."""
     plan = Plan()
     width, kind = rng.uniform(3.0, 3.3), "right_before_left" if variant % 2 else "priority"
     turned, waves, phase = rng.uniform(0, 2 * math.pi), rng.uniform(0.3, 0.7), rng.uniform(0, 2 * math.pi)
@@ -226,14 +226,14 @@ def residential(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def town(rng: np.random.Generator, variant: int) -> Plan:
-    """Streets of one to three lanes each way that cross each other; the wider ones at signals."""
+    """Return a grid of streets with one to three lanes per direction; crossings of wide streets have signals."""
     plan = Plan()
     turned, width = rng.uniform(0, 2 * math.pi), rng.uniform(3.1, 3.6)
     axes = _unit(turned), _unit(turned + math.pi / 2)
-    crossed = 2 + variant % 2, 2 + variant // 2 % 2  # how many streets there are along each axis
+    crossed = 2 + variant % 2, 2 + variant // 2 % 2  # number of streets along each axis
     places = [_places(rng, number) for number in crossed]
     lanes = [rng.integers(1, 4, size=number) for number in crossed]
-    lanes[variant % 2][0] = 2 + variant % 2  # one street at least is wide
+    lanes[variant % 2][0] = 2 + variant % 2  # at least one street is wide
     at: dict[str, FloatArray] = {}
     for i, x in enumerate(places[0]):
         for j, y in enumerate(places[1]):
@@ -255,10 +255,10 @@ def town(rng: np.random.Generator, variant: int) -> Plan:
 
 
 def crossing(rng: np.random.Generator, variant: int) -> Plan:
-    """Two wide streets that cross at signals; one or two lanes for turning left on each arm, facing the opposite ones.
+    """Return a signalised crossing of two wide streets; each arm has one or two left-turn lanes opposite each other.
 
-    The middle line of a street gives way for them, on either side of the crossing the other way. So what comes the
-    other way is not left of the middle line that a driver sees ahead of him, as it is in a `junction`.
+    The centre line of a street shifts to make room for these lanes, in opposite directions on the two sides of the
+    crossing. Unlike in a `junction`, oncoming vehicles are therefore not left of the extended centre line.
     """
     plan = Plan()
     plan.node("c", np.zeros(2), type="traffic_light")
@@ -289,7 +289,7 @@ _BUILDERS: dict[str, Callable[[np.random.Generator, int], Plan]] = {
 
 
 def _places(rng: np.random.Generator, number: int) -> FloatArray:
-    """How far parallel streets are from a town's middle [m], in order."""
+    """Return the sorted distances of parallel streets from a town's centre [m]."""
     gaps = rng.uniform(60, 110, number - 1)
     return np.r_[0.0, np.cumsum(gaps)] - gaps.sum() / 2 + rng.uniform(-20, 20)
 
@@ -297,7 +297,7 @@ def _places(rng: np.random.Generator, number: int) -> FloatArray:
 def _street(
     plan: Plan, start: str, end: str, at: dict[str, FloatArray], rng: np.random.Generator, lanes: int, width: float
 ) -> None:
-    """A straight road one way between two nodes; if it leads to a crossing, perhaps with a lane for turning left."""
+    """Add a straight one-way road between two nodes, optionally with a left-turn lane before a crossing."""
     shape = np.array([at[start], at[end]])
     pocket = end.startswith("c") and np.hypot(*(shape[1] - shape[0])) > 55 and rng.random() < 0.4
     split = float(rng.uniform(22, 35)) if pocket else 0.0
@@ -316,9 +316,9 @@ def _arm(
     aside: float = 0.0,
     priority: int = 5,
 ) -> None:
-    """A road of `lanes` each way from the node "c" outwards, straight or curved.
+    """Add a straight or curved road outwards from the node "c", with `lanes` per direction.
 
-    For so long a `pocket` there are more for `turning` left, and its middle line is that far `aside` for them.
+    `turning` additional left-turn lanes exist over the length `pocket`, where the centre line is shifted by `aside`.
     """
     curvature = float(rng.choice([0.0, 1.0, -1.0])) * rng.uniform(1 / 500, 1 / 180)
     straight, end = pocket or 50.0, f"n{name}"
@@ -333,7 +333,7 @@ def _arm(
 
 
 def _line(start: float, end: float, angle: float, curvature: float, straight: float = 0.0) -> FloatArray:
-    """(N, 2) points that leave the origin's surroundings at distance `start` in this direction, then bend."""
+    """Return (N, 2) points of a line that starts at distance `start` from the origin in this direction, then curves."""
     along = np.linspace(start, end, max(2, math.ceil((end - start) / _POINT_SPACING) + 1))
     heading = angle + curvature * np.maximum(along - start - straight, 0.0)
     steps = np.diff(along)[:, None] * _units((heading[:-1] + heading[1:]) / 2)
@@ -341,7 +341,7 @@ def _line(start: float, end: float, angle: float, curvature: float, straight: fl
 
 
 def _bend(start: FloatArray, leaving: FloatArray, end: FloatArray, arriving: FloatArray) -> FloatArray:
-    """(N, 2) a smooth curve between two points with these directions (a Bézier curve)."""
+    """Return (N, 2) points of a Bézier curve between two points with these directions."""
     reach = 0.45 * np.hypot(*(end - start))
     a = start + reach * leaving / np.hypot(*leaving)
     b = end - reach * arriving / np.hypot(*arriving)
@@ -351,7 +351,7 @@ def _bend(start: FloatArray, leaving: FloatArray, end: FloatArray, arriving: Flo
 
 
 def _cut(line: FloatArray, shares: FloatArray) -> list[FloatArray]:
-    """The pieces of a line between these shares of its length."""
+    """Return the pieces of a line between these fractions of its length."""
     length = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
     pieces = []
     for low, high in zip(shares[:-1] * length[-1], shares[1:] * length[-1], strict=True):
@@ -362,7 +362,7 @@ def _cut(line: FloatArray, shares: FloatArray) -> list[FloatArray]:
 
 
 def _shifted(line: FloatArray, right: float | FloatArray) -> FloatArray:
-    """A line moved to its right, everywhere alike or (N,) point by point."""
+    """Shift a line to its right, by one distance or by (N,) distances of its points."""
     tangent = np.gradient(line, axis=0)
     tangent /= np.hypot(*tangent.T)[:, None]
     moved: FloatArray = line + np.reshape(right, (-1, 1)) * np.column_stack([tangent[:, 1], -tangent[:, 0]])
@@ -387,7 +387,7 @@ def _element(tag: str, **attributes: object) -> str:
 
 
 def build(plan: Plan, file: Path) -> None:
-    """Run netconvert on a plan and store what it makes."""
+    """Run netconvert on a plan and store the network."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         for tag, elements in (("node", plan.nodes), ("edge", plan.edges), ("connection", plan.connections)):
@@ -399,7 +399,7 @@ def build(plan: Plan, file: Path) -> None:
         command += ["--tls.green.time", "20", "--no-turnarounds.geometry", "--aggregate-warnings", "3"]
         subprocess.run(command, cwd=work, check=True, stdout=subprocess.DEVNULL)
         text = (work / "net.xml").read_text()
-    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)  # the date of building
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)  # the build date
     file.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
@@ -410,7 +410,7 @@ def main() -> None:
         for name in names:
             kind, _, index = name.partition(f"_{split}_")
             rng = np.random.default_rng([NETWORK_KINDS.index(kind), split_index, int(index)])
-            # Validation and test go on counting where training stops, so that they are not its first variants again.
+            # Variant numbers continue across the splits, so that validation and test variants differ from training.
             variant = int(index) + 4 * split_index
             file = NETWORKS_FOLDER / f"{name}.net.xml.gz"
             build(_BUILDERS[kind](rng, variant), file)

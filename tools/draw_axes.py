@@ -1,4 +1,4 @@
-"""The picture of docs/interoperability.md: one car, and what it is in the axes of each format.
+"""Draw the picture of docs/interoperability.md: the values of one car's box in the axes of each format.
 
 python tools/draw_axes.py docs/images/axes.png
 """
@@ -19,7 +19,7 @@ CAR = Boxes([(10.0, -3.0, -1.0)], [(4.5, 1.9, 1.5)], [math.radians(30.0)])
 
 
 def main() -> None:
-    """Draw the picture to the path that is given."""
+    """Draw the picture to the given path."""
     x, y, z, height, width, length, yaw = centers_from_boxes(CAR)[0]
     record = nuscenes_from_boxes(CAR)[0]
     kitti = kitti_from_boxes(CAR)[0]
@@ -59,18 +59,18 @@ def main() -> None:
 
 
 def draw(axes: Axes, names: tuple[str, str], side: int) -> None:
-    """The sensor, its two axes and the car, seen from above with the front up.
+    """Draw the sensor, its two axes and the car, in a top view with the front up.
 
     Args:
         axes: the plot.
-        names: of the axis that points forward and of the one that points to a side.
-        side: 1 if the latter points to the right, -1 if to the left.
+        names: names of the forward axis and of the lateral axis.
+        side: 1 if the lateral axis points to the right, -1 if to the left.
     """
     corners = CAR.bev_corners()[0]
     axes.fill(-corners[:, 1], corners[:, 0], facecolor="none", edgecolor=OTHER, linewidth=1.5)
     front = corners[[0, 3]].mean(axis=0)
     axes.plot([-CAR.center[0, 1], -front[1]], [CAR.center[0, 0], front[0]], color=OTHER)
-    style = {"arrowstyle": "<-", "color": EGO, "linewidth": 2.0}  # annotations point from their text
+    style = {"arrowstyle": "<-", "color": EGO, "linewidth": 2.0}  # arrows of annotations start at their text
     for name, end, at in ((names[0], (0.0, 6.0), "bottom"), (names[1], (4.0 * side, 0.0), "center")):
         axes.annotate(name, (0.0, 0.0), end, arrowprops=style, color=EGO, fontsize=12, ha="center", va=at)
     axes.plot(0.0, 0.0, "o", color=EGO)

@@ -1,4 +1,4 @@
-"""The picture of docs/node.md: what a node does with the messages of an agent that has every kind of trouble.
+"""Draw the picture of docs/node.md: how a node handles the messages of an agent with faults of every kind.
 
 python tools/draw_node.py            # writes docs/images/node.png
 """
@@ -30,7 +30,7 @@ END = 30.0
 
 
 def main() -> None:
-    """Drive through the junction and draw what was received, and the verdicts."""
+    """Run a node on a drive through the junction and draw the received messages and the verdicts."""
     frames = list(Junction(3, JunctionSettings(agents=3)))
     frames = [*frames, *frames[-2:0:-1]]
     ego, other, twin = NodeCore("car1", 1), NodeCore("car2", 100), NodeCore("car2", 300)
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def draw_picture(dots: list[tuple[float, str]], verdicts: list[tuple[float, str]]) -> None:
-    """Messages by what became of them, above the alignment's verdict."""
+    """Draw the messages by outcome, above the alignment's verdicts."""
     figure = new_figure(11.0, 4.2)
     messages, verdict = add_axes(figure, 2, 1, heights=[6.0, 1.0])
     for row, kind in enumerate(KINDS):

@@ -1,7 +1,7 @@
-"""The figures of docs/alignment_method.md: `python tools/method_figures.py docs/images`.
+"""Draw the figures of docs/alignment_method.md: `python tools/method_figures.py docs/images`.
 
-A simulated motorway, the other agent's list 0.2 s late: the two lists under the true pose as they were sent, and with
-the other's boxes brought to the ego's instant by the estimated offset; and how the estimates settle over the frames.
+The scene is a simulated motorway on which the other agent's list is 0.2 s late. The figures show the two lists under
+the true pose as sent, the lists after motion compensation by the estimated time offset, and the estimates over time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def draw(axes: Axes, frame: PairFrame, other: Boxes, title: str) -> None:
-    """Both lists in the ego frame."""
+    """Draw both lists in the ego frame."""
     for boxes, colour, label in ((frame.ego, EGO_COLOUR, "ego's list"), (other, OTHER_COLOUR, "other's list")):
         for i, corners in enumerate(boxes.bev_corners()):
             axes.add_patch(Polygon(corners, fill=False, color=colour, lw=1.6, label=label if i == 0 else None))
@@ -54,7 +54,7 @@ def draw(axes: Axes, frame: PairFrame, other: Boxes, title: str) -> None:
 
 
 def settle(axes: Axes, frames: list[PairFrame], alignments: list[Alignment]) -> None:
-    """Estimated offset and landing error over time."""
+    """Draw the estimated time offset and the landing error over time."""
     times = np.arange(len(frames)) * 0.1
     offset = [1000 * a.time_offset if a.accepted else np.nan for a in alignments]
     error = [

@@ -1,4 +1,4 @@
-"""What `mkdocs.yml` cannot say: the README is the first page, and links to files outside of docs/ become plain text."""
+"""MkDocs hooks: use the README as the first page, and turn links to files outside of docs/ into plain text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 
 def on_files(files: Files, *, config: Any) -> Files:
-    """Add the README as index.md, its links seen from docs/."""
+    """Add the README as index.md, with its links relative to docs/."""
     text = (_PROJECT / "README.md").read_text(encoding="utf-8")
     text = re.sub(r"\]\((?!https:|docs/)", "](../", text).replace("](docs/", "](")
     files.append(File.generated(config, "index.md", content=text))
@@ -21,7 +21,7 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """The text of a page, with links that leave docs/ taken out: a site has no source files, and no known address."""
+    """Remove links to files outside of docs/ from a page: the site does not contain source files."""
     docs = _PROJECT / "docs"
     folder = (docs / page.file.src_uri).parent
 

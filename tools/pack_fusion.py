@@ -1,9 +1,9 @@
-"""Makes the fusion weights that come with the package from training runs, and the card that says how they came about.
+"""Create the shipped fusion weights and their model card from training runs.
 
     python tools/pack_fusion.py compact runs/fusion
 
-takes `runs/fusion/METHOD/last.safetensors` of every method that learns; those without a finished run keep what they
-have.
+reads `runs/fusion/METHOD/last.safetensors` for each method with trainable weights. The weights of methods without a
+finished run are kept.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main() -> None:
             continue
         file = WEIGHTS / f"{arguments.detector}_{name}.safetensors"
         run = arguments.runs / name / "last.safetensors"
-        if run.is_file() and (trained := method(detector).load(run)).metadata["metrics"]:  # it was finished
+        if run.is_file() and (trained := method(detector).load(run)).metadata["metrics"]:  # the run is finished
             trained.save(file, half=True)
         if file.is_file():
             rows.append(_row(name, method(detector).load(file), file))
@@ -61,19 +61,19 @@ def _row(name: str, method: IntermediateFusion, file: Path) -> str:
 
 _CARD = """# Model card: fusion methods on the `{detector}` detector
 
-What each method has beyond the detector: neck, head and its own layers, in half precision. The detector's pillars and
-backbone are frozen and not in these files; a file has their fingerprint, and is refused by a detector with others.
+The weights of each method's neck, head and fusion layers, in half precision. The detector's pillar encoder and backbone
+are frozen and not stored in these files. Each file contains their fingerprint and is rejected for another detector.
 
 - **Data**: simulated drives of the `train` networks only (SUMO traffic, embreex LiDAR; 2 or 3 agents), made by the
-  command; no real cloud was used. Truth: objects that all agents together have at least 5 points on.
+  command; no real point clouds were used. Ground truth: objects with at least 5 points from all agents together.
 - **Command**: `cobevglue train fusion --config METHOD --out runs/fusion/METHOD`, then
   `python tools/pack_fusion.py {detector} runs/fusion`. Settings, commit, seed, machine and time are in each file's
   header.
-- **Poses in training**: true ones with Gaussian noise on every agent (column *noise*), as the method's paper has it
-  where it says so. One sample in five has nobody but the ego in it.
-- **AP** below: 96 frames of the `validation` networks on true poses, objects with at least 5 points, range of the
-  detector; a check that training went well. The figures to compare methods by are in `docs/results/`;
-  how learning rates were chosen is in `docs/collaboration.md`.
+- **Poses in training**: true poses with Gaussian noise on every agent (column *noise*), as in the method's paper where
+  it gives a value. One sample in five contains only the ego.
+- **AP** in the table: 96 frames of the `validation` networks with true poses, objects with at least 5 points, within
+  the detector's range. It only verifies that training converged; `docs/results/` has the results for comparing methods.
+  `docs/collaboration.md` describes the choice of learning rates.
 
 | method | weights | file | noise | samples | time | AP 0.5 | AP 0.7 | commit |
 |---|---|---|---|---|---|---|---|---|

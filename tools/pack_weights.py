@@ -1,11 +1,11 @@
-"""Makes the weights that come with the package from a training run: half precision, and how they came about inside.
+"""Create the shipped detector weights from a training run: half precision, with the training history as metadata.
 
     python tools/pack_weights.py compact runs/compact/last.safetensors [runs/stage1/last.safetensors …]
 
-Further files are the runs that it started from (`init_from`), the first one first, or what this program made of them;
-of each, commit, command and settings are kept. The training of heading refinement (`train heading`) keeps those of its
-detector by itself; `--heading-refiner` takes that of another file. How boxes are chosen is no part of training, and is
-taken from `CONFIGS`.
+Further files are the earlier runs that it was initialised from (`init_from`) in order, or their packed weights; commit,
+command and settings of each are stored. The training of heading refinement (`train heading`) stores those of its
+detector itself; `--heading-refiner` copies the heading refiner of another file. The detection settings are not part of
+training and are taken from `CONFIGS`.
 """
 
 from __future__ import annotations

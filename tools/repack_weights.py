@@ -1,8 +1,8 @@
-"""Rewrites the header of weights files, and the names of their tensors if need be; the numbers stay bit for bit.
+"""Rewrite the header of weights files and, optionally, the names of their tensors. The weights are unchanged.
 
     python tools/repack_weights.py src/cobevglue/*/weights/*.safetensors
 
-makes absolute paths in the metadata relative. For another change, call `repack` with other functions.
+makes absolute paths in the metadata relative. For other changes, call `repack` with other functions.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ def repack(
     metadata: Callable[[Any], Any] = without_absolute_paths,
     name: Callable[[str], str] = lambda old: old,
 ) -> None:
-    """Write a file again.
+    """Rewrite a file.
 
     Args:
         path: the file, which is replaced.
-        metadata: the new metadata for the old, plain data.
-        name: the new name of a tensor for the old.
+        metadata: maps the old metadata to the new metadata, plain data.
+        name: maps the old name of a tensor to the new name.
     """
     with safe_open(str(path), framework="pt") as file:
         header = dict(file.metadata() or {})
@@ -44,7 +44,7 @@ def repack(
 
 
 def main() -> None:
-    """Repack the files named on the command line."""
+    """Repack the files given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=Path, nargs="+")
     for path in parser.parse_args().files:

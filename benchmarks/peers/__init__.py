@@ -1,7 +1,7 @@
-"""Matchers of other papers on BEVGlue's input, each written from its paper, for `benchmarks/alignment.py --only peers`.
+"""Matchers of other papers on BEVGlue's input, implemented from the papers: `benchmarks/alignment.py --only peers`.
 
-They are no part of the package. None is given a pose, a trajectory or tracks; those that expect a rough pose run
-without.
+They are not part of the package. None of them receives a pose, a trajectory or tracks; matchers that use an initial
+pose run without one.
 """
 
 from __future__ import annotations
@@ -22,4 +22,4 @@ PEERS: dict[str, type[SingleFrameMatcher]] = {
     "CBM": CBM,
     "Clipper": Clipper,
 }
-"""From the name that `peers.search` takes to the class."""
+"""Matchers by their name in `peers.search`."""

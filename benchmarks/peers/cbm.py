@@ -1,23 +1,23 @@
-"""CBM, context-based matching: boxes that see the same surroundings, and the matches that vouch for each other.
+"""CBM, context-based matching: match boxes with similar surroundings and keep the mutually consistent matches.
 
 Song et al., "A Spatial Calibration Method for Robust Cooperative Perception" (arXiv:2304.12033), Algorithm 1. The
-abstract and a description of the released code were at hand, not the equations.
+implementation follows the abstract and a description of the released code; the equations were not available.
 
-As described: the context of a box is the positions of all others in its own frame (heading forward). Two boxes'
-contexts are matched where the directions differ by at most sigma 1 and the positions by at most sigma 2 (L1). Each such
-local matching is then judged by its members ("onlookers"), and matches without global consensus are dropped, as are
-rows and columns with more than one match. The largest matching gives the pose by SVD; one whose boxes are too far apart
-is rejected.
+As described: the context of a box consists of the positions of all others in its own frame (heading forward). Two
+contexts match where the directions differ by at most sigma 1 and the positions by at most sigma 2 (L1). The members of
+each such local matching ("onlookers") then vote on its matches; matches without global consensus are dropped, as are
+rows and columns with more than one match. The pose is computed from the largest matching by SVD. A matching whose boxes
+are too far apart is rejected.
 
-Filled in or left out:
+Our choices and omissions:
 
-- The paper starts from a rough pose: headings are folded to (-90, 90] degrees, which is safe only if both agents'
-  frames point the same way. Here there is none. Headings count modulo pi, too, but a pair of boxes is tried with both
-  of its contexts, and an onlooker votes with the one that agrees.
-- How onlookers vote: a match stays if at least `consensus` of the members of the local matching have it in theirs.
-- The distance by which a matching is rejected is that of the centres after the pose's own fit.
-- Of equally large matchings the one with the smallest distance wins (in the released code the last one).
-- The smallest number of matches.
+- The paper uses an initial pose: it wraps headings to (-90, 90] degrees, which is valid only if both agents' frames
+  have similar directions. Here no initial pose is given. Headings are compared modulo pi as well, but each pair of
+  boxes is tested with both of its contexts, and an onlooker votes with the one that agrees.
+- Voting: a match is kept if at least the share `consensus` of the members have it in their own local matchings.
+- A matching is rejected by the mean distance of the centres after the least-squares fit.
+- Of equally large matchings the one with the smallest distance is used (in the released code the last one).
+- The minimum number of matches.
 
 The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search CBM` (see `peers/search.py`), 2026-11-27.
 """
@@ -42,14 +42,15 @@ __all__ = ["CBM"]
 
 @dataclass
 class CBM(SingleFrameMatcher):
-    """CBM without its rough pose.
+    """CBM without an initial pose.
 
     Attributes:
-        angle: sigma 1, largest difference of two directions [rad]; 10 degrees in the released code.
-        position: sigma 2, largest L1 difference of two positions [m]; 3 there, 1 in its strict variant.
-        consensus: share of the members of a local matching that have to agree with a match.
-        max_distance: largest mean distance of matched centres under the pose [m]; 20 there, of the rough pose.
-        min_matches: fewer are refused.
+        angle: sigma 1, maximum difference of two directions [rad]; 10 degrees in the released code.
+        position: sigma 2, maximum L1 difference of two positions [m]; 3 in the released code, 1 in its strict variant.
+        consensus: minimum share of the members of a local matching that agree with a match.
+        max_distance: maximum mean distance of matched centres under the pose [m]; 20 under the initial pose in the
+            released code.
+        min_matches: minimum number of matches; with fewer the alignment is refused.
     """
 
     angle: float = math.radians(30.0)
@@ -60,11 +61,11 @@ class CBM(SingleFrameMatcher):
 
     @classmethod
     def published(cls) -> CBM:
-        """The tolerances of the released code; consensus and the least number of matches are ours."""
+        """Return CBM with the tolerances of the released code; consensus and minimum number of matches are ours."""
         return cls(math.radians(10.0), position=3.0, consensus=0.5, max_distance=20.0, min_matches=2)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
-        """The pose of the largest matching with consensus."""
+        """Estimate the pose from the largest matching with consensus."""
         best = Alignment.refused("no two contexts agree")
         nearest = math.inf
         for matches in self._largest_matchings(ego, other):
@@ -76,7 +77,7 @@ class CBM(SingleFrameMatcher):
         return best
 
     def _largest_matchings(self, ego: Boxes, other: Boxes) -> list[IntArray]:
-        """All matchings (K, 2) that are one-to-one, have consensus, and are of the largest size."""
+        """Return all one-to-one matchings (K, 2) with consensus that have the largest size."""
         m, n = len(ego), len(other)
         local = self._local_matchings(ego, other)
         agree = local + eye_array(local.shape[0], format="csr", dtype=np.int32)
@@ -95,7 +96,7 @@ class CBM(SingleFrameMatcher):
         return [np.array(sorted(matches)) for matches in sorted(found)]
 
     def _local_matchings(self, ego: Boxes, other: Boxes) -> csr_array:
-        """(2 M N, 2 M N) 1 where the context of a pair matches another pair.
+        """Return (2 M N, 2 M N) 1 where the context of a pair matches another pair.
 
         Index 2 (i N + j) + t is the pair (i, j) with its headings as they are (t = 0), or one of them reversed (t = 1).
         """
@@ -108,7 +109,7 @@ class CBM(SingleFrameMatcher):
             a, b = mine[:, None, :, None], sign * theirs[None, :, None, :]
             gap = a - b
             near = np.abs(gap.real) + np.abs(gap.imag) <= self.position
-            # Directions: a . b >= cos(angle) |a| |b|; a box in its own context has no direction and never matches.
+            # Directions: a . b >= cos(angle) |a| |b|; a box has no direction in its own context and never matches.
             length = np.abs(a) * np.abs(b)
             near &= ((a * np.conj(b)).real >= math.cos(self.angle) * length) & (length > 0.0)
             seed, pair = np.nonzero(near.reshape(m * n, m * n) & same[:, None] & same[None, :])
@@ -119,7 +120,7 @@ class CBM(SingleFrameMatcher):
 
 
 def _contexts(boxes: Boxes) -> np.typing.NDArray[np.complex128]:
-    """(N, N) position of box n in the frame of box m, x + iy [m]."""
+    """Return (N, N) positions of box n in the frame of box m, as complex numbers x + iy [m]."""
     position = boxes.center[:, 0] + 1j * boxes.center[:, 1]
     context: np.typing.NDArray[np.complex128] = (position[None, :] - position[:, None]) * np.exp(-1j * boxes.yaw)[
         :, None
@@ -128,7 +129,7 @@ def _contexts(boxes: Boxes) -> np.typing.NDArray[np.complex128]:
 
 
 def _mean_distance(ego: Boxes, other: Boxes, matches: IntArray) -> float:
-    """Mean distance of matched centres under their least-squares pose [m]."""
+    """Return the mean distance of matched centres under their least-squares pose [m]."""
     a: FloatArray = ego.center[matches[:, 0], :2]
     b = other.center[matches[:, 1], :2]
     gap = procrustes(a, b).apply(b) - a

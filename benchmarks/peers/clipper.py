@@ -2,24 +2,24 @@
 
 Lusk, Fathian, How, "CLIPPER: A Graph-Theoretic Framework for Robust Data Association" (ICRA 2021, arXiv:2011.10202),
 and Lusk, How, "CLIPPER: Robust Data Association without an Initial Guess" (RA-L 2024, arXiv:2402.07284): the densest
-edge-weighted clique and its first-order relaxation. Its own bindings are not on PyPI and have to be built from source,
-so this follows the papers, of which only the abstracts were at hand.
+edge-weighted clique and its first-order relaxation. The authors' bindings are not on PyPI and must be built from
+source. This implementation follows the papers' abstracts; the full texts were not available.
 
 Associations are the nodes of a graph: all pairs of boxes, one of each agent. The affinity of two is exp(-c^2 / 2
 sigma^2), with c the difference of the distances between the boxes, and 0 where c exceeds epsilon or where they share a
-box. u' M u over u >= 0, |u| <= 1 is maximised by projected gradient ascent with backtracking, where inconsistent
-associations are charged with a penalty d that grows until none is left together. omega = round(u' M u) associations
-with the largest u are selected, and give the pose by SVD.
+box. u' M u over u >= 0, |u| <= 1 is maximised by projected gradient ascent with backtracking. A penalty d on pairs of
+inconsistent associations increases until no such pair remains. The omega = round(u' M u) associations with the largest
+u are selected, and the pose is computed from them by SVD.
 
-Filled in:
+Our choices:
 
-- CLIPPER takes any invariant. `heading` adds a second one: the angle between two headings, modulo pi. It also rules out
-  most mirrored sets, which distances do not.
-- The start is M 1 rather than random, and the penalty grows by the smallest ratio that makes an inconsistent
-  association fall.
-- Associations with fewer than `min_matches` - 1 consistent ones are removed first: they are in no clique that is
-  accepted.
-- The smallest number of matches.
+- CLIPPER can use any invariant. `heading` adds a second one: the angle between two headings, modulo pi. Unlike
+  distances, it also excludes most mirrored sets.
+- The initial u is M 1 instead of random, and the penalty increases by the smallest ratio that decreases the u of an
+  inconsistent association.
+- Associations with fewer than `min_matches` - 1 consistent associations are removed first: no accepted clique can
+  contain them.
+- The minimum number of matches.
 
 The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search Clipper` (see `peers/search.py`), 2026-11-27.
 """
@@ -40,23 +40,24 @@ from peers.single_frame import SingleFrameMatcher, distances, pose_of_matches, s
 __all__ = ["Clipper"]
 
 _STEPS, _PENALTIES, _BACKTRACKS = 200, 100, 20
-"""Most steps of the ascent for one penalty, most penalties, most step lengths."""
+"""Maximum numbers of ascent steps per penalty, of penalties, and of step lengths."""
 _BETA = 0.25
 """Factor of the step length in backtracking."""
 _TOLERANCE = 1e-6
-"""A step that changes u by less ends the ascent; smaller entries of u are 0."""
+"""The ascent ends when a step changes u by less than this; smaller entries of u are set to 0."""
 
 
 @dataclass
 class Clipper(SingleFrameMatcher):
-    """CLIPPER on box centres, with headings as a further invariant.
+    """CLIPPER on box centres, with headings as a second invariant.
 
     Attributes:
-        sigma: scale of the difference of two distances [m]; 0.01 by default there, which is far too small for boxes.
-        epsilon: largest consistent difference [m]; 0.06 there.
-        min_distance: of two boxes of one agent, for their associations to be consistent [m]; 0 there.
-        heading: largest consistent difference of angles between headings, modulo pi [rad]; pi / 2 for no limit.
-        min_matches: fewer are refused.
+        sigma: scale of the difference of two distances [m]; 0.01 in the authors' library, too small for boxes.
+        epsilon: maximum consistent difference of two distances [m]; 0.06 in the authors' library.
+        min_distance: minimum distance of two boxes of one agent with consistent associations [m]; 0 in the authors'
+            library.
+        heading: maximum consistent difference of angles between headings, modulo pi [rad]; pi / 2 for no limit.
+        min_matches: minimum number of matches; with fewer the alignment is refused.
     """
 
     sigma: float = 0.8
@@ -67,11 +68,11 @@ class Clipper(SingleFrameMatcher):
 
     @classmethod
     def published(cls) -> Clipper:
-        """The defaults of its own library, for points known to centimetres, and distances only."""
+        """Return CLIPPER with the defaults of the authors' library, for centimetre accuracy, with distances only."""
         return cls(sigma=0.01, epsilon=0.06, min_distance=0.0, heading=math.pi / 2, min_matches=2)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
-        """The pose of the densest clique."""
+        """Estimate the pose from the densest clique."""
         affinity = self._affinity(ego, other)
         nodes = _core(affinity, self.min_matches - 1)
         if not len(nodes):
@@ -85,7 +86,7 @@ class Clipper(SingleFrameMatcher):
         return pose_of_matches(ego, other, matches, self.min_matches)
 
     def _affinity(self, ego: Boxes, other: Boxes) -> FloatArray:
-        """(M N, M N) affinities with ones on the diagonal; row i N + j is the association (i, j)."""
+        """Return (M N, M N) affinities with ones on the diagonal; row i N + j is the association (i, j)."""
         m, n = len(ego), len(other)
         mine, theirs = distances(ego)[:, None, :, None], distances(other)[None, :, None, :]
         gap = mine - theirs
@@ -104,7 +105,7 @@ class Clipper(SingleFrameMatcher):
 
 
 def densest_clique(affinity: FloatArray) -> FloatArray:
-    """(n,) u >= 0 of unit length, a local maximum of u' M u that is zero outside of a clique.
+    """Return (n,) u >= 0 of unit length: a local maximum of u' M u that is zero outside of a clique.
 
     Args:
         affinity: (n, n) M, symmetric, ones on the diagonal, 0 where two nodes are inconsistent.
@@ -125,11 +126,11 @@ def densest_clique(affinity: FloatArray) -> FloatArray:
 
 
 def _ascend(matrix: FloatArray, u: FloatArray) -> FloatArray:
-    """Projected gradient ascent of u' A u on the part of the unit sphere with u >= 0."""
+    """Maximise u' A u by projected gradient ascent on the part of the unit sphere with u >= 0."""
     product = matrix @ u
     value = float(u @ product)
     for _ in range(_STEPS):
-        gradient = 2.0 * (product - value * u)  # its component along the sphere
+        gradient = 2.0 * (product - value * u)  # the component tangential to the sphere
         step = 1.0
         for _ in range(_BACKTRACKS):
             moved = np.maximum(u + step * gradient, 0.0)
@@ -149,7 +150,7 @@ def _ascend(matrix: FloatArray, u: FloatArray) -> FloatArray:
 
 
 def _core(affinity: FloatArray, degree: int) -> np.typing.NDArray[np.int64]:
-    """Nodes of the largest subgraph in which each has at least `degree` neighbours."""
+    """Return the nodes of the largest subgraph in which each node has at least `degree` neighbours."""
     adjacent = affinity > 0.0
     nodes = np.arange(len(adjacent))
     while len(nodes):

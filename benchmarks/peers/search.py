@@ -1,12 +1,12 @@
-"""Random search for the settings of a peer, on half of the development sequences.
+"""Random search for the settings of a peer method on half of the development sequences.
 
-    PYTHONPATH=benchmarks python -m peers.search            # all peers, some minutes
+    PYTHONPATH=benchmarks python -m peers.search            # all peers, a few minutes
     PYTHONPATH=benchmarks python -m peers.search CBM VIPS
 
-Data: V2V4Real train 0000 to 0005 (`v2v4real_sequences`, seed 0), every fifth of the frames with at least two co-visible
-objects, each on its own. Criterion: share of right frames less three times the share of wrong ones. The first row is
-the published settings, then come 60 draws, each setting drawn independently from its choices in `SPACES`; the best are
-printed, and the best of all is what the classes have as defaults.
+Data: V2V4Real train 0000 to 0005 (`v2v4real_sequences`, seed 0), every fifth frame with at least two co-visible
+objects, independently of the other frames. Criterion: share of right frames minus three times the share of wrong
+frames. The first row is the published settings, followed by the best of 60 draws, for which each setting is drawn
+independently from its choices in `SPACES`. The best settings of all are the defaults of the classes.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ SPACES: dict[str, Mapping[str, Sequence[Any]]] = {
         "min_matches": (2, 3, 4, 5),
     },
 }
-"""The choices for each setting of each peer."""
+"""Choices for each setting of each peer."""
 
 
 def main() -> None:
     """Search and print the best settings of each peer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("peers", nargs="*", metavar="PEER", help=f"of {', '.join(PEERS)}; all if none is named")
+    parser.add_argument("peers", nargs="*", metavar="PEER", help=f"of {', '.join(PEERS)}; default: all")
     parser.add_argument("--draws", type=int, default=DRAWS)
     arguments = parser.parse_args()
     frames = frames_to_search_on(DATA)
@@ -89,7 +89,7 @@ def main() -> None:
 
 
 def frames_to_search_on(data: Path) -> list[AlignmentSequence]:
-    """The frames that settings are searched on, each as a sequence of its own."""
+    """Return the frames for the search, each as a separate sequence."""
     frames = [
         AlignmentSequence(sequence.name, [frame])
         for sequence in v2v4real_sequences(data / "v2v4real_detections", SEARCHED_ON)
@@ -102,7 +102,7 @@ def frames_to_search_on(data: Path) -> list[AlignmentSequence]:
 def search(
     peer: type[SingleFrameMatcher], space: Mapping[str, Sequence[Any]], frames: list[AlignmentSequence], draws: int
 ) -> list[tuple[Settings, Summary]]:
-    """The results of the published settings and of `draws` settings, in the order in which they were drawn."""
+    """Evaluate the published settings and `draws` random settings; results are in the order of the draws."""
     rng = np.random.default_rng(SEED)
     drawn = [{name: choices[int(rng.integers(len(choices)))] for name, choices in space.items()} for _ in range(draws)]
     published = dataclasses.asdict(peer.published())  # type: ignore[call-overload]
@@ -113,13 +113,13 @@ def search(
 
 
 def criterion(summary: Summary) -> float:
-    """Share of right frames less `WRONG_COSTS` times the share of wrong ones."""
+    """Return the share of right frames minus `WRONG_COSTS` times the share of wrong frames."""
     wrong = 1.0 - summary.refused - summary.right
     return summary.right - WRONG_COSTS * wrong
 
 
 def show(what: str, settings: Settings, summary: Summary) -> None:
-    """One line of results."""
+    """Print one line of results."""
     values = ", ".join(f"{name}={value:.4g}" for name, value in settings.items())
     wrong = 1.0 - summary.refused - summary.right
     print(f"- {what}: criterion {criterion(summary):.3f} (right {summary.right:.3f}, wrong {wrong:.3f}): {values}")

@@ -1,4 +1,4 @@
-"""What the matchers of `benchmarks/peers` share: they look at one frame and remember nothing."""
+"""Base class of the matchers in `benchmarks/peers`: alignment of single frames without memory."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ __all__ = ["SingleFrameMatcher", "distances", "pose_of_matches", "same_class"]
 
 
 class SingleFrameMatcher:
-    """An `Aligner` without memory. Subclasses implement `match` and `published`; their defaults were searched."""
+    """A memoryless `Aligner`. Subclasses implement `match` and `published`; their defaults are from `peers.search`."""
 
     @classmethod
     def published(cls) -> SingleFrameMatcher:
-        """The matcher with the settings of its paper or code, where they are known."""
+        """Return the matcher with the settings of its paper or code, where these are known."""
         raise NotImplementedError
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
-        """The relative pose of two lists of at least two boxes each."""
+        """Estimate the relative pose of two lists of at least two boxes each."""
         raise NotImplementedError
 
     def align(self, ego: Boxes, other: Boxes, time: float | None = None) -> Alignment:
-        """The pose of `other` (its own frame) in `ego`'s frame; refused if a list has fewer than two boxes."""
+        """Estimate ego_SE2_other; refused if a list has fewer than two boxes."""
         if min(len(ego), len(other)) < 2:
             return Alignment.refused(f"{len(ego)} and {len(other)} boxes, at least two each are needed")
         return self.match(ego, other)
 
     def reset(self) -> None:
-        """There is nothing to forget."""
+        """Do nothing: the matcher has no memory."""
 
 
 def pose_of_matches(ego: Boxes, other: Boxes, matches: IntArray, min_matches: int) -> Alignment:
-    """The least-squares pose of matched box centres; refused where there are too few.
+    """Estimate the least-squares pose of matched box centres; refused with too few matches.
 
     Args:
         ego: M boxes in the ego frame.
         other: N boxes in the other agent's frame.
         matches: (K, 2) rows of ego and other.
-        min_matches: smallest K that is accepted.
+        min_matches: minimum K that is accepted.
     """
     if len(matches) < min_matches:
         return Alignment.refused(f"{len(matches)} boxes matched, {min_matches} are needed")
@@ -50,14 +50,14 @@ def pose_of_matches(ego: Boxes, other: Boxes, matches: IntArray, min_matches: in
 
 
 def distances(boxes: Boxes) -> FloatArray:
-    """(N, N) distances between the centres, from above [m]."""
+    """Return (N, N) horizontal distances between the centres [m]."""
     step = boxes.center[:, None, :2] - boxes.center[None, :, :2]
     length: FloatArray = np.hypot(step[..., 0], step[..., 1])
     return length
 
 
 def same_class(ego: Boxes, other: Boxes) -> BoolArray:
-    """(M, N) whether two boxes have the same label; True where a list has no labels."""
+    """Return (M, N) whether two boxes have the same label; True if a list has no labels."""
     if ego.label is None or other.label is None:
         return np.ones((len(ego), len(other)), np.bool_)
     same: BoolArray = ego.label[:, None] == other.label[None, :]

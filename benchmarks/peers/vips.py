@@ -1,20 +1,22 @@
-"""VIPS' matcher: spectral graph matching of boxes and their distances and headings.
+"""VIPS's matcher: spectral graph matching of boxes by their sizes, distances and headings.
 
 Shi et al., "VIPS: Real-Time Perception Fusion for Infrastructure-Assisted Autonomous Driving" (MobiCom 2022), the graph
-matching part. The text was not at hand while this was written, only a description of an unofficial implementation, so
-there are no equation numbers.
+matching part. This implementation follows a description of an unofficial implementation; the full text was not
+available, so equation numbers are missing.
 
-As described: a matrix holds the affinities of all pairs of boxes (one of each agent), on the diagonal those of nodes,
-off it those of edges, each a mean of exponentials of two differences. Its leading eigenvector, scaled to [0, 1], is the
-confidence of each pair; the assignment of largest sum is found, and pairs below a threshold are dropped.
+As described: a matrix contains the affinities of all pairs of boxes (one of each agent): node affinities on the
+diagonal, edge affinities elsewhere, each a mean of exponentials of two differences. Its leading eigenvector, scaled to
+[0, 1], is the confidence of each pair; the assignment with the largest total confidence is computed, and pairs below a
+threshold are dropped.
 
-Filled in or left out:
+Our choices and omissions:
 
-- The affinity of nodes also has a term of their positions in the world. It needs a rough pose, which an object list
-  alone does not give, and is left out: the affinity of a node is that of its length and width.
-- Pairs that share a box have no edge (affinity 0), as is usual in spectral matching.
-- The smallest number of matches. Confidences are relative to the largest, so that the threshold alone refuses nothing.
-  The paper's tracking of objects and its compensation of delays are left out.
+- The paper's node affinity also has a term for world positions. It requires an initial pose, which is not available
+  from object lists, and is omitted: the node affinity depends on length and width only.
+- Pairs that share a box have no edge (affinity 0), as usual in spectral matching.
+- The minimum number of matches. Confidences are relative to the largest, so the threshold alone never causes a
+  refusal.
+- The paper's object tracking and delay compensation are omitted.
 
 The defaults are the best of `PYTHONPATH=benchmarks python -m peers.search VIPS` (see `peers/search.py`), 2026-11-27.
 """
@@ -37,15 +39,15 @@ __all__ = ["VIPS"]
 
 @dataclass
 class VIPS(SingleFrameMatcher):
-    """VIPS without its rough pose.
+    """VIPS without an initial pose.
 
     Attributes:
-        size_rate: of the node affinity exp(-rate (dl^2 + dw^2)) [1/m^2]; 0.5 in the implementation described.
-        distance_rate: of the first term of the edge affinity, exp(-rate dd^2) [1/m^2]; 0.5 there.
-        heading_rate: of the second, exp(-rate |sin dpsi|), psi the angle between two headings; 0.1 there.
-        heading_share: weight of the second term, that of the first is 1 minus this; 0.5 there.
-        threshold: smallest confidence of a match, of at most 1; 0.5 there.
-        min_matches: fewer are refused.
+        size_rate: rate of the node affinity exp(-rate (dl^2 + dw^2)) [1/m^2]; 0.5 in the described implementation.
+        distance_rate: rate of the first term of the edge affinity, exp(-rate dd^2) [1/m^2]; 0.5 there.
+        heading_rate: rate of the second term, exp(-rate |sin dpsi|), psi the angle between two headings; 0.1 there.
+        heading_share: weight of the second term, with 1 minus this for the first term; 0.5 there.
+        threshold: minimum confidence of a match, from 0 to 1; 0.5 there.
+        min_matches: minimum number of matches; with fewer the alignment is refused.
     """
 
     size_rate: float = 0.5
@@ -57,11 +59,11 @@ class VIPS(SingleFrameMatcher):
 
     @classmethod
     def published(cls) -> VIPS:
-        """The settings of the implementation described, and the least number of matches that gives a pose."""
+        """Return VIPS with the settings of the described implementation and the minimum number of matches."""
         return cls(0.5, 0.5, 0.1, 0.5, threshold=0.5, min_matches=2)
 
     def match(self, ego: Boxes, other: Boxes) -> Alignment:
-        """The pose of the confident matches."""
+        """Estimate the pose from the confident matches."""
         affinity = self._affinity(ego, other)
         if not affinity.any():
             return Alignment.refused("no boxes of the same class")
@@ -73,7 +75,7 @@ class VIPS(SingleFrameMatcher):
         return pose_of_matches(ego, other, matches, self.min_matches)
 
     def _affinity(self, ego: Boxes, other: Boxes) -> FloatArray:
-        """(M N, M N) affinities of pairs of boxes; row i N + j is the pair (i, j)."""
+        """Return (M N, M N) affinities of pairs of boxes; row i N + j is the pair (i, j)."""
         m, n = len(ego), len(other)
         same = same_class(ego, other)
         sizes = ego.size[:, None, :2] - other.size[None, :, :2]

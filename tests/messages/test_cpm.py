@@ -426,8 +426,8 @@ def test_field_outside_its_limits_is_named(make: Callable[[], Any], expected: st
         ({"age": [1, -1]}, "age: row 1 is -1.0"),
         ({"measurement_offset": [0, 5]}, r"measurement_offset: row 1 is 5.0, .* at most 2.046"),
         ({"position_std": [-1, 0]}, "standard deviations must be >= 0, row 0 is -1.0"),
-        ({"body": BODY.replace(center=[(9, 0, 0)])}, "body must stand on the origin"),
-        ({"is_infrastructure": True}, "heading: a roadside unit must know it"),
+        ({"body": BODY.replace(center=[(9, 0, 0)])}, "body must be located at the origin"),
+        ({"is_infrastructure": True}, "heading: required for a roadside unit"),
     ],
 )
 def test_what_would_arrive_wrong_is_not_encoded(changes: dict[str, Any], expected: str) -> None:

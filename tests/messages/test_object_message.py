@@ -211,7 +211,7 @@ def test_message_outside_limits_raises(changes: dict[str, Any], expected: str) -
             {"center": [[0, 0, 0], [60_000.0018, 0, 0]]},
             r"center: row 1 is \[60000.0018, 0.0, 0.0\], too far from the other",
         ),
-        ({"center": [[0, 0, 60_000.0018], [0, 0, 0]]}, "center: row 0 is .* it would arrive 0.0018 m off"),
+        ({"center": [[0, 0, 60_000.0018], [0, 0, 0]]}, "center: row 0 is .* its rounding error would be 0.0018 m"),
         ({"size": [[4, 1e-60, 1], [4, 2, 1]]}, "boxes do not fit float32: size: row 0"),
     ],
 )

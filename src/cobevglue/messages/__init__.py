@@ -1,4 +1,4 @@
-"""Messages between agents: the object message and arrays in bytes, and the object list as a JSON file.
+"""Messages between agents: object messages and array messages as bytes, and object lists as JSON files.
 
 `cobevglue.messages.cpm` is ETSI's Collective Perception Message in place of the object message,
 `cobevglue.messages.sdsm` is SAE's Sensor Data Sharing Message.

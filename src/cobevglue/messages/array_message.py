@@ -6,14 +6,14 @@ Layout of version 1, little endian throughout:
 |-------|---------|----------------------------------------------------|
 | 4     | bytes   | magic, `CBVA`                                      |
 | 1     | uint8   | version, 1                                         |
-| 1     | uint8   | how many arrays follow                             |
+| 1     | uint8   | number of arrays                                   |
 | 4     | uint32  | after the arrays: CRC-32 (zlib's) of all before it |
 
 and of each array: length of its name (uint8), the name (UTF-8), type (uint8), number of dimensions (uint8), shape
 (uint32 each), and the numbers in C order.
 
-The length of these bytes is the communication volume of what is shared for fusion. What is rounded before (features to
-float16) is up to the sender; nothing is compressed.
+The length of the encoded bytes is the communication volume of the data shared for fusion. The sender chooses the types
+(for example float16 for features); the arrays are not compressed.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ _TYPES = [np.dtype(name) for name in ("<f2", "<f4", "<f8", "u1", "<u2", "<u4", "
 
 
 def encode_arrays(arrays: Arrays) -> bytes:
-    """The bytes of some arrays, in the layout that this module's docstring describes.
+    """Encode arrays in the layout described in this module's docstring.
 
     Raises:
-        MessageError: too many arrays, too long a name, or a type that does not travel.
+        MessageError: more than 255 arrays, a name that is empty or longer than 255 bytes, or an unsupported type.
     """
     if len(arrays) > 255:
         raise MessageError(f"{len(arrays)} arrays, a message holds at most 255")
@@ -53,7 +53,7 @@ def encode_arrays(arrays: Arrays) -> bytes:
         text = name.encode("utf-8")
         dtype = array.dtype.newbyteorder("<") if array.dtype.byteorder == ">" else array.dtype
         if dtype not in _TYPES or not 1 <= len(text) <= 255 or array.ndim > 255:
-            raise MessageError(f"array {name!r} of {array.dtype} with {array.ndim} dimensions does not travel")
+            raise MessageError(f"array {name!r} of {array.dtype} with {array.ndim} dimensions cannot be encoded")
         shape = struct.pack(f"<BB{array.ndim}I", _TYPES.index(dtype), array.ndim, *array.shape)
         parts += [bytes([len(text)]), text, shape, np.ascontiguousarray(array, dtype).tobytes()]
     body = b"".join(parts)
@@ -61,10 +61,10 @@ def encode_arrays(arrays: Arrays) -> bytes:
 
 
 def decode_arrays(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays in these bytes, read-only.
+    """Decode a message into arrays by name; the arrays are read-only.
 
     Raises:
-        MessageError: these are not exactly one undamaged message of a known version.
+        MessageError: the bytes are not exactly one intact message of a known version.
     """
     end = len(data) - _CHECKSUM.size
     if end < _HEADER.size:

@@ -1,20 +1,20 @@
-"""ETSI's Collective Perception Message (CPM, TS 103 324 V2.1.1) in place of our own object message.
+"""ETSI's Collective Perception Message (CPM, TS 103 324 V2.1.1), an alternative to the package's object message.
 
     data = encode(CollectivePerception(station_id=7, time=t, boxes=boxes, heading=yaw_from_east))
     decode(data).boxes  # in the sender's frame again
 
-The types are in `cpm.asn`, encoded in unaligned PER. Needs: pip install 'cobevglue[cpm]'
+The types are defined in `cpm.asn` and encoded in unaligned PER. Requires: pip install 'cobevglue[cpm]'
 
-How the fields are filled:
+Content of the fields:
 
 | field of the standard | content | unit |
 |---|---|---|
 | referenceTime | `time` | 1 ms |
 | referencePosition | `latitude`, `longitude`, `altitude` of the frame's origin | 1e-7 degree, 0.01 m |
-| orientationAngle | `heading`, clockwise from north there; of vehicles only | 0.1 degree |
+| orientationAngle | `heading`, converted to clockwise from north; vehicles only | 0.1 degree |
 | objectId | track id modulo 65535, which the standard requires; 65535 is the sender's own vehicle | |
 | measurementDeltaTime | `measurement_offset` | 1 ms |
-| position | box centre east, north and above of the reference position | 0.01 m, up to 1310.7 m |
+| position | box centre relative to the reference position: east, north, up | 0.01 m, up to 1310.7 m |
 | velocity | `velocity`, east and north | 0.01 m/s |
 | zAngle | yaw, counter-clockwise from east | 0.1 degree |
 | objectDimensionX, Y, Z | length, width, height; a height of 0 (unknown) is left out | 0.1 m, up to 25.4 m |
@@ -22,18 +22,19 @@ How the fields are filled:
 | objectPerceptionQuality | score | 1/15 |
 | classification | label | |
 
-- Values are rounded to the nearest multiple of their unit. The standard's tables round up, which gives a receiver that
-  multiplies by the unit, as receivers do, a bias of half a unit.
-- Objects are turned by the heading as it is sent (to 0.1 degree), so that the receiver restores the sender's frame
-  without an error from the heading's rounding.
+- Values are rounded to the nearest multiple of their unit. Rounding up, as in the standard's tables, would cause a bias
+  of half a unit in receivers that multiply by the unit.
+- Objects are rotated by the heading after its rounding to 0.1 degree, so that this rounding causes no error when the
+  receiver restores the sender's frame.
 - **Without GNSS**: latitude, longitude and `heading` of None are sent as unavailable, and coordinates are along the
-  sender's own axes. No receiver can place such a list on a map; BEVGlue does not need to.
-- A roadside unit has no heading in the standard. Its boxes arrive in axes east and north, with `heading` 0.
-- The standard has no box of the sender itself in a CPM (its size is in the CAM). `body` is sent as one more object with
-  the id 65535 that stands on the reference position; other receivers see an object where the sender is.
-- Objects of other senders without length, width or zAngle are no boxes: they are counted in `omitted`.
-- One message holds at most 255 objects; segmentation is not implemented. A CPM has no checksum: integrity is up to the
-  signature around it (TS 103 097).
+  sender's own axes. A receiver cannot place such a list on a map; BEVGlue does not need a map position.
+- The standard defines no heading for a roadside unit. Its boxes are decoded along the axes east and north, with
+  `heading` 0.
+- A standard CPM does not contain the sender's own box (the CAM contains its size). `body` is sent as an additional
+  object with the id 65535 at the reference position; other receivers decode it as an ordinary object.
+- Received objects without length, width or zAngle cannot be represented as boxes; `omitted` is their number.
+- One message contains at most 255 objects; segmentation is not implemented. A CPM has no checksum: its integrity is
+  protected by the signature of the surrounding packet (TS 103 097).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from cobevglue.typing import FloatArray
 __all__ = ["MAX_OBJECTS", "OWN_VEHICLE", "SENSOR_TYPES", "CollectivePerception", "decode", "encode"]
 
 MAX_OBJECTS = 255
-"""Most objects of one message, the own vehicle included."""
+"""Maximum number of objects in one message, including the own vehicle."""
 OWN_VEHICLE = 65535
 """objectId of the sender's own vehicle; track ids are taken modulo this number."""
 SENSOR_TYPES = (
@@ -70,29 +71,29 @@ _NO_LATITUDE, _NO_LONGITUDE, _NO_ALTITUDE, _NO_ANGLE = 900_000_001, 1_800_000_00
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CollectivePerception:
-    """What one agent saw at one time, as a CPM holds it.
+    """Content of a CPM: the objects that one agent observed at one time.
 
     Attributes:
         station_id: the sender, 0 to 2^32 - 1.
-        time: of the list [s], 0 to 4.4e9: since 2004-01-01 UTC with leap seconds counted (5 s ahead of UTC since 2017),
-            or the clock of a simulation.
-        boxes: the objects in the sender's own frame, with `track_id`. Scores must be within 0 and 1.
-        body: one-row box of the sender's own vehicle in the same frame, which stands on its origin; or None.
+        time: time stamp of the list [s], 0 to 4.4e9: seconds since 2004-01-01 UTC including leap seconds (5 s ahead of
+            UTC since 2017), or simulation time.
+        boxes: the objects in the sender's own frame, with `track_id`. Scores must be from 0 to 1.
+        body: one-row box of the sender's own vehicle in the same frame, located at its origin; or None.
         heading: yaw of the frame's x axis, counter-clockwise from east [rad]; None for unknown.
-        latitude: of the frame's origin [degrees]; None for unknown.
-        longitude: likewise.
-        altitude: likewise [m].
+        latitude: latitude of the frame's origin [degrees]; None for unknown.
+        longitude: longitude of the frame's origin [degrees]; None for unknown.
+        altitude: altitude of the frame's origin [m]; None for unknown.
         is_infrastructure: whether the sender is a roadside unit.
         velocity: (N, 2) velocities over ground along the axes of the frame [m/s], NaN where unknown; or None.
-        age: (N,) for how long the objects have been observed [s], NaN where unknown; or None.
-        measurement_offset: (N,) when the objects were measured, relative to `time` [s]; None for at `time`.
+        age: (N,) time since each object was first observed [s], NaN where unknown; or None.
+        measurement_offset: (N,) measurement time of each object relative to `time` [s]; None if all are 0.
         position_std: (N,) standard deviations of x and y [m], NaN where unknown; or None. Sent as the 95 % interval.
-        yaw_std: (N,) likewise of the yaw [rad].
+        yaw_std: (N,) standard deviations of the yaw [rad], NaN where unknown; or None. Sent as the 95 % interval.
         sensor_type: a name in `SENSOR_TYPES`, or None to send no sensor information. Not read from received messages.
-        omitted: objects of a received message that had no size or heading.
+        omitted: number of received objects without size or heading.
 
     Raises:
-        MessageError: a field is outside of its limits; it names the field and the row.
+        MessageError: a field is out of range; the error names the field and the row.
     """
 
     station_id: int
@@ -140,39 +141,39 @@ class CollectivePerception:
 
     @property
     def agent_id(self) -> str:
-        """The sender, as in an `ObjectMessage`: the station id as text."""
+        """Sender id as in an `ObjectMessage`: the station id as text."""
         return str(self.station_id)
 
     @classmethod
     def from_message(cls, message: ObjectMessage, **fields: Any) -> CollectivePerception:
-        """The CPM of an object message.
+        """Convert an object message to a CPM.
 
         Args:
-            message: its agent id is the station id as text, unless `station_id` is given.
+            message: the object message. Its agent id must be the station id as text, unless `station_id` is given.
             fields: further fields, such as `heading` and `velocity`.
 
         Raises:
-            MessageError: the agent id is not a number, or a field is outside of its limits.
+            MessageError: the agent id is not a number, or a field is out of range.
         """
         if "station_id" not in fields:
             fields["station_id"] = station_id_of(message)
         return cls(time=message.time, boxes=message.boxes, body=message.body, **fields)
 
     def object_message(self, frame: int = 0) -> ObjectMessage:
-        """The object message of this CPM; a CPM has no frame count, so the caller gives it."""
+        """Convert to an object message. A CPM has no frame count, so the caller provides it."""
         return ObjectMessage(self.agent_id, self.time, frame, self.boxes, self.body)
 
 
 def encode(message: CollectivePerception) -> bytes:
-    """The bytes of a CPM.
+    """Encode a CPM.
 
     Raises:
-        MessageError: a field that the standard requires is missing, or a value is out of its range; it names field and
-            row.
+        MessageError: a field that the standard requires is missing, or a value is out of range; the error names field
+            and row.
         ModuleNotFoundError: asn1tools is not installed.
     """
     if message.is_infrastructure and message.heading is None:
-        raise MessageError("heading: a roadside unit must know it, since its CPM cannot say that it is unknown")
+        raise MessageError("heading: required for a roadside unit, whose CPM cannot mark it as unavailable")
     angle, orientation = _sent_heading(message)
     objects = objects_from_columns(_columns(message), angle)
     containers = [(_ROADSIDE, CPM.encode("OriginatingRsuContainer", {}))]
@@ -196,12 +197,12 @@ def encode(message: CollectivePerception) -> bytes:
 
 
 def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
-    """The CPM in these bytes.
+    """Decode a CPM.
 
-    Sensor information, perception regions, and what of an object `CollectivePerception` does not hold, are skipped.
+    Sensor information, perception regions and object fields without an attribute in `CollectivePerception` are ignored.
 
     Raises:
-        MessageError: these are not exactly one CPM with valid boxes; it says why.
+        MessageError: the bytes are not exactly one CPM with valid boxes; the error gives the reason.
         ModuleNotFoundError: asn1tools is not installed.
     """
     data = whole_bytes(data)
@@ -255,7 +256,7 @@ def decode(data: bytes | bytearray | memoryview) -> CollectivePerception:
 
 
 def _sent_heading(message: CollectivePerception) -> tuple[float, int]:
-    """The angle by which objects are turned to the axes of the message [rad], and the orientationAngle."""
+    """Return the rotation from the sender's axes to those of the message [rad], and the orientationAngle."""
     if message.heading is None:
         return 0.0, _NO_ANGLE
     if message.is_infrastructure:
@@ -272,7 +273,7 @@ def _received_heading(vehicle: bytes | None) -> float | None:
 
 
 def _heading_of(orientation: int) -> float:
-    """From tenths of degrees clockwise from north to radians counter-clockwise from east, in (-pi, pi]."""
+    """Convert tenths of degrees clockwise from north to radians counter-clockwise from east, in (-pi, pi]."""
     tenths = (900 - orientation) % 3600
     return math.radians((tenths - 3600 if tenths > 1800 else tenths) / 10.0)
 
@@ -281,7 +282,7 @@ def _reference_position(message: CollectivePerception) -> dict[str, Any]:
     altitude = _NO_ALTITUDE if message.altitude is None else round(100.0 * message.altitude)
     return {
         "latitude": _NO_LATITUDE if message.latitude is None else round(1e7 * message.latitude),
-        # -180 degrees itself is reserved.
+        # The value for -180 degrees is reserved.
         "longitude": _NO_LONGITUDE
         if message.longitude is None
         else max(round(1e7 * message.longitude), -1_799_999_999),
@@ -295,7 +296,7 @@ def _reference_position(message: CollectivePerception) -> dict[str, Any]:
 
 
 def _columns(message: CollectivePerception) -> Columns:
-    """The objects and, as the last one, the own vehicle."""
+    """Return the objects and, as the last row, the own vehicle."""
     boxes = message.boxes
     if len(boxes) and boxes.track_id is None:
         raise MessageError("boxes must have a track_id, since the standard requires objectId: use a tracker")

@@ -1,4 +1,4 @@
-"""The objects of a CPM: from boxes and further columns to `PerceivedObject`s, and back."""
+"""Conversion between boxes with further columns and the `PerceivedObject`s of a CPM."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _VEHICLES = {
     "tram": 11,
     "agricultural": 14,
 }
-"""vehicleSubClass by label. A van is a light truck there."""
+"""vehicleSubClass by label. The standard classifies a van as a light truck."""
 _ROAD_USERS = {
     "pedestrian": ("pedestrian", "ordinary-pedestrian"),
     "cyclist": ("bicyclistAndLightVruVehicle", "bicyclist"),
@@ -45,14 +45,14 @@ _SYNONYMS = {"bicycle": "cyclist", "bicyclist": "cyclist", "motorcyclist": "moto
 
 
 def objects_from_columns(columns: Columns, heading: float) -> list[dict[str, Any]]:
-    """The `PerceivedObject`s, in the form that asn1tools takes.
+    """Convert boxes and columns to `PerceivedObject`s, in the form that asn1tools encodes.
 
     Args:
         columns: N objects with track ids 0 to 65535, in the sender's frame.
-        heading: of the sender's x axis in the axes of the message [rad].
+        heading: heading of the sender's x axis in the axes of the message [rad].
 
     Raises:
-        MessageError: a value is out of its range; it names field and row.
+        MessageError: a value is out of range; the error names field and row.
     """
     boxes = columns.boxes.transform(SE2(0.0, 0.0, heading))
     centers = whole_units("center (east, north, up)", boxes.center, _CENTIMETRE, _MAX_COORDINATE, "a CPM")
@@ -93,21 +93,21 @@ def objects_from_columns(columns: Columns, heading: float) -> list[dict[str, Any
 
 
 def read_objects(objects: list[dict[str, Any]], heading: float) -> tuple[Columns, int]:
-    """The boxes and columns of decoded `PerceivedObject`s, in the sender's frame.
+    """Convert decoded `PerceivedObject`s to boxes and columns in the sender's frame.
 
     Args:
-        objects: as asn1tools returns them.
-        heading: of the sender's x axis in the axes of the message [rad].
+        objects: `PerceivedObject`s as decoded by asn1tools.
+        heading: heading of the sender's x axis in the axes of the message [rad].
 
     Returns:
-        The columns, and the number of objects that are left out for want of length, width or angle.
+        The columns, and the number of objects omitted because length, width or angle is missing.
 
     Raises:
         ValueError: invalid boxes, such as two objects with one id.
     """
     whole = [item for item in objects if _is_box(item)]
     n = len(whole)
-    # measured in units first: dividing by the unit again gives the same number
+    # multiplying whole units, so that encoding again gives the same numbers
     centers = np.array([_center(item) for item in whole]).reshape(n, 3) * _CENTIMETRE
     sizes = np.array([[_size(item, axis) for axis in "XYZ"] for item in whole]).reshape(n, 3) * _DECIMETRE
     angles = np.array([item["angles"]["zAngle"]["value"] for item in whole]).reshape(n) * _TENTH_OF_DEGREE
@@ -170,13 +170,13 @@ def _add_scores(objects: list[dict[str, Any]], score: FloatArray | None) -> None
     outside = (score < 0) | (score > 1)
     if outside.any():
         row = int(outside.argmax())
-        raise MessageError(f"score: row {row} is {score[row]}, a CPM holds scores from 0 to 1: leave them out")
+        raise MessageError(f"score: row {row} is {score[row]}, a CPM holds scores from 0 to 1 only")
     for item, value in zip(objects, score.tolist(), strict=True):
         item["objectPerceptionQuality"] = round(15.0 * value)
 
 
 def _confidences(std: FloatArray | None, n: int, unit: float, out_of_range: int, unavailable: int) -> IntArray:
-    """Half widths of 95 % intervals, rounded up as the standard says; a millionth of a unit is no reason to."""
+    """Return half widths of 95 % intervals, rounded up to whole units except for an excess below a millionth."""
     if std is None:
         return np.full(n, unavailable)
     if (std < 0).any():
@@ -194,12 +194,12 @@ def _standard_deviations(confidences: list[int], unit: float, out_of_range: int)
 
 
 def _if_any(values: FloatArray) -> FloatArray | None:
-    """The column, or None if nothing in it is known."""
+    """Return the column, or None if all its values are unknown."""
     return values if not np.isnan(values).all() else None
 
 
 def _is_box(item: dict[str, Any]) -> bool:
-    """Whether length, width and angle are known and the position is within the range of the standard."""
+    """Return whether length, width and angle are known and the position is within the standard's range."""
     inside = all(abs(value) <= _MAX_COORDINATE for value in _center(item))
     angle: int = item.get("angles", {}).get("zAngle", {}).get("value", _NO_ANGLE)
     return inside and angle != _NO_ANGLE and _size(item, "X") > 0 and _size(item, "Y") > 0
@@ -215,13 +215,13 @@ def _coordinate_confidence(item: dict[str, Any]) -> int:
 
 
 def _size(item: dict[str, Any], axis: str) -> int:
-    """In decimetres, 0 for unknown."""
+    """Return a dimension in decimetres, 0 for unknown."""
     value: int = item.get(f"objectDimension{axis}", {}).get("value", _NO_SIZE)
     return 0 if value == _NO_SIZE else value
 
 
 def _velocity(item: dict[str, Any]) -> tuple[float, float]:
-    """Velocity along the axes of the message [m/s], NaN where it is unknown."""
+    """Return the velocity along the axes of the message [m/s], NaN where unknown."""
     kind, value = item.get("velocity", ("none", {}))
     if kind == "cartesianVelocity":
         x, y = value["xVelocity"]["value"], value["yVelocity"]["value"]
@@ -238,7 +238,7 @@ def _velocity(item: dict[str, Any]) -> tuple[float, float]:
 
 
 def _class_of(label: str) -> tuple[str, Any]:
-    """The objectClass of a label; of one that the standard does not have, "other, unknown"."""
+    """Return the objectClass of a label, or "other, unknown" for a label that the standard does not define."""
     name = _SYNONYMS.get(label.lower(), label.lower())
     if name in _VEHICLES:
         return "vehicleSubClass", _VEHICLES[name]
@@ -248,7 +248,7 @@ def _class_of(label: str) -> tuple[str, Any]:
 
 
 def _label(item: dict[str, Any]) -> str:
-    """The label of the class with the highest confidence, "unknown" if there is none of ours."""
+    """Return the label of the class with the highest confidence, or "unknown" if no label corresponds to it."""
     classes = item.get("classification", [])
     if not classes:
         return "unknown"

@@ -1,12 +1,12 @@
-"""The object list: boxes as a JSON document that people and other programs can write.
+"""The object list: boxes as a JSON document.
 
     {"boxes": [{"x": 12.5, "y": -3.0, "z": -1.1, "l": 4.5, "w": 1.9, "h": 1.5, "yaw": 0.1,
                 "score": 0.9, "track_id": 7, "label": "car"}]}
 
-Centres and sizes are in metres and yaw is in radians, in the frame of the agent that saw the boxes (x forward, y left,
-z up, yaw from x towards y). `x`, `y`, `l`, `w` and `yaw` are required; `z` and `h` are 0 where they are left out;
-`score`, `track_id` and `label` are in all rows or in none. `null` counts as left out. No other key is allowed, so that
-a misspelt one is not silently ignored.
+Centres and sizes are in metres and yaw is in radians, in the frame of the observing agent (x forward, y left, z up, yaw
+from x towards y). `x`, `y`, `l`, `w` and `yaw` are required; `z` and `h` default to 0; `score`, `track_id` and `label`
+must be given in all rows or in none. A value of `null` is the same as a missing key. Unknown keys are errors, so that a
+misspelt key is not silently ignored.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ _SYNONYMS = {
     "class": "label",
     "type": "label",
 }
-"""What other formats call our keys: spelling alone would not lead from these to ours."""
+"""Key names of other formats, mapped to the keys of the object list, for suggestions in error messages."""
 _LARGEST_ID = 2**63 - 1
 
 
 class _RepeatedKey(dict[str, Any]):
-    """A JSON object in which a key came twice; Python's parser would silently keep the last."""
+    """A JSON object with a repeated key; Python's parser would silently keep the last value."""
 
     key: str
 
 
 def read_object_list(path: str | Path) -> Boxes:
-    """The boxes of an object list file.
+    """Read the boxes of an object list file.
 
     Args:
         path: a JSON file, UTF-8.
@@ -57,24 +57,24 @@ def read_object_list(path: str | Path) -> Boxes:
         Boxes in the frame of the agent that wrote the file.
 
     Raises:
-        ValueError: one line that names the file, and the row and field where the content is wrong.
+        ValueError: the content is invalid; the one-line message names the file, the row and the field.
         OSError: the file cannot be read; the message names it.
     """
     source = str(path)
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")  # a byte order mark, as some editors write it, is no error
+        text = Path(path).read_text(encoding="utf-8-sig")  # accepts a byte order mark, which some editors write
         document = json.loads(text, object_pairs_hook=_object)
     except UnicodeDecodeError as error:
         raise ValueError(f"{source}: not JSON: not UTF-8 text (byte {error.start})") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"{source}: not JSON: {error.msg} (line {error.lineno}, column {error.colno})") from None
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting without end
-        raise ValueError(f"{source}: not JSON that can be read: {error}") from None
+    except (ValueError, RecursionError) as error:  # a number with thousands of digits, or too deep nesting
+        raise ValueError(f"{source}: unreadable JSON: {error}") from None
     return from_dict(document, source=source)
 
 
 def write_object_list(path: str | Path, boxes: Boxes) -> None:
-    """Write an object list file, one row a line; `read_object_list` gives the same numbers back exactly.
+    """Write an object list file, one row per line; `read_object_list` restores exactly the same numbers.
 
     Raises:
         OSError: the file cannot be written.
@@ -85,9 +85,9 @@ def write_object_list(path: str | Path, boxes: Boxes) -> None:
 
 
 def to_dict(boxes: Boxes) -> dict[str, list[dict[str, Any]]]:
-    """`boxes` as the document of an object list: plain Python values, ready for `json.dumps`.
+    """Convert boxes to the document of an object list: plain Python values for `json.dumps`.
 
-    Fields that `boxes` does not have are left out. A list without rows therefore loses which fields it had.
+    Fields that `boxes` does not have are omitted, so an empty list does not record which fields were present.
     """
     columns: dict[str, list[Any]] = {
         "x": boxes.center[:, 0].tolist(),
@@ -106,17 +106,17 @@ def to_dict(boxes: Boxes) -> dict[str, list[dict[str, Any]]]:
 
 
 def from_dict(document: Any, source: str = "object list") -> Boxes:
-    """The boxes of an object list that is already parsed.
+    """Convert the parsed document of an object list to boxes.
 
     Args:
-        document: what `to_dict` returns, or `json.loads` of such a text.
-        source: how error messages name the document; a file name for example.
+        document: the document, as returned by `to_dict` or `json.loads`.
+        source: name of the document in error messages, for example a file name.
 
     Returns:
         Boxes in the frame of the agent that made the list.
 
     Raises:
-        ValueError: one line that names `source`, and the row and field where the content is wrong.
+        ValueError: the content is invalid; the one-line message names `source`, the row and the field.
     """
     if not isinstance(document, dict):
         raise ValueError(f'{source}: must be a JSON object {{"boxes": [...]}}, got {_kind(document)}')
@@ -148,7 +148,7 @@ def from_dict(document: Any, source: str = "object list") -> Boxes:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A parsed JSON object, marked if a key is repeated (the row is not known here, only in `from_dict`)."""
+    """Return the parsed JSON object, or `_RepeatedKey` for `from_dict`, which can report the row."""
     whole = dict(pairs)
     if len(whole) == len(pairs):
         return whole
@@ -159,7 +159,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_keys(mapping: dict[Any, Any], valid: tuple[str, ...], where: str) -> None:
-    """Refuse keys that came twice and keys that are not valid, naming the nearest one that is."""
+    """Reject repeated and unknown keys; the error names the nearest valid key."""
     if isinstance(mapping, _RepeatedKey):
         raise ValueError(f"{where}: the key {_shown(mapping.key)} comes twice")
     for key in mapping:
@@ -177,7 +177,7 @@ def _nearest(key: str, valid: tuple[str, ...]) -> str:
 
 
 def _value(row: dict[str, Any], key: str, where: str) -> Any:
-    """The value of `key` in `row`, checked: a float, an int (track_id), a string (label), or None where left out."""
+    """Return the checked value of `key`: a float, an int (track_id), a string (label), or None if missing."""
     value = row.get(key)
     if value is None:
         if key in _REQUIRED:
@@ -195,7 +195,7 @@ def _value(row: dict[str, Any], key: str, where: str) -> Any:
         return int(value)
     try:
         number = float(value)
-    except OverflowError:  # an integer of hundreds of digits
+    except OverflowError:  # an integer with hundreds of digits
         number = math.inf
     if not math.isfinite(number):
         raise ValueError(f"{where}: {key} must be a finite number, got {_shown(value)}")
@@ -203,7 +203,7 @@ def _value(row: dict[str, Any], key: str, where: str) -> Any:
 
 
 def _all_or_none(values: list[Any], key: str, source: str) -> list[Any] | None:
-    """The column, or None if no row has it; an error if some rows have it and some do not."""
+    """Return the column, or None if no row has it; ValueError if only some rows have it."""
     absent = [value is None for value in values]
     if all(absent):
         return None
@@ -216,11 +216,11 @@ def _all_or_none(values: list[Any], key: str, source: str) -> list[Any] | None:
 
 
 def _kind(value: Any) -> str:
-    """What a JSON value is, in JSON's words."""
+    """Return the JSON name of a value's type."""
     kinds = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", type(None): "null"}
     return next((name for kind, name in kinds.items() if isinstance(value, kind)), f"a {type(value).__name__}")
 
 
 def _shown(value: Any) -> str:
-    """The value for a one-line message, shortened if it is long."""
+    """Return the value as text for a one-line message, shortened if it is long."""
     return reprlib.repr(value)

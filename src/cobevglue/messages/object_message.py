@@ -1,4 +1,4 @@
-"""The message an agent sends in each frame: eight numbers an object, as in the paper, behind a small header.
+"""The message that an agent sends in each frame: a header and eight numbers per object, as in the paper.
 
 Layout of version 2, little endian throughout, A = length of the agent id in bytes, N = number of objects:
 
@@ -15,20 +15,21 @@ Layout of version 2, little endian throughout, A = length of the agent id in byt
 | 36+A     | 32 N  | float32 | per object x, y from the origin, z, l, w, h [m], yaw [rad], and track id    |
 | 36+A+32N | 4     | uint32  | CRC-32 (zlib's) of all bytes before it                                      |
 
-Version 1 has no origin: the agent id is at offset 20, and x and y are in the sender's frame. It is read, not written.
+Version 1 has no origin: the agent id is at offset 20, and x and y are in the sender's frame. Version 1 can be decoded,
+but only version 2 is encoded.
 
-- float32 is exact to 0.5 mm up to 16 km only, and a northing in UTM is 5,000 km: hence the origin. It is the median
-  position, rounded to multiples of 1,024 m, and so 0 in the frame of a vehicle. A coordinate that arrives more than
-  1 mm off all the same is an error.
-- Scores and labels are not sent: the paper sends eight numbers an object, and alignment needs no others.
-- The sender's own vehicle, if it transmits one, is the last object, with -2 in place of the track id.
-- Track ids are whole numbers from 0 to 2^24, which float32 holds exactly. Boxes without track ids carry -1 in every
-  row but that of the own vehicle; -1 in only some is an error. A message without objects decodes to boxes without
-  track ids.
-- A yaw outside [-pi, pi] is wrapped into it before it is rounded to float32, so that large angles lose nothing.
-- The CRC finds corruption (every single flipped bit among it), not forgery: a message is not authenticated.
+- The origin keeps float32 accurate in map coordinates: float32 resolves 0.5 mm only up to 16 km, but a northing in UTM
+  can be 5,000 km. The origin is the median position, rounded to multiples of 1,024 m, and so 0 in the frame of a
+  vehicle. A coordinate whose rounding error exceeds 1 mm is rejected.
+- Scores and labels are not sent: the paper sends eight numbers per object, and alignment does not need more.
+- The box of the sender's own vehicle, if sent, is the last object, with -2 in place of the track id.
+- Track ids are integers from 0 to 2^24, which float32 represents exactly. Boxes without track ids have -1 in every row
+  except that of the own vehicle; -1 in only some of these rows is an error. A message without objects decodes to boxes
+  without track ids.
+- A yaw outside [-pi, pi] is wrapped into this interval before rounding to float32, which preserves its precision.
+- The CRC detects corruption (including every single flipped bit), but not forgery: messages are not authenticated.
 
-The length of these bytes is the communication volume of the boxes that is reported everywhere.
+The length of the encoded bytes is the communication volume of the boxes in all reported results.
 """
 
 from __future__ import annotations
@@ -58,45 +59,45 @@ __all__ = [
 ]
 
 VERSION = 2
-"""The layout that is written; version 1 is read, too."""
+"""Version that is encoded; version 1 can be decoded as well."""
 MAX_OBJECTS = 4096
-"""Most objects in one message: far above any scene, and it bounds a message at 131,176 bytes."""
+"""Maximum number of objects in one message, far more than any scene has; it limits a message to 131,176 bytes."""
 MAX_AGENT_ID_BYTES = 64
-"""Longest agent id, in bytes of its UTF-8 form."""
+"""Maximum length of an agent id in UTF-8 [bytes]."""
 MAX_TRACK_ID = 2**24
-"""Largest track id: up to here float32 holds every whole number exactly."""
+"""Largest track id: float32 represents every integer up to this one exactly."""
 MAX_FRAME = 2**32 - 1
-"""Largest frame count: at 10 Hz, 13 years."""
+"""Largest frame count, reached after 13 years at 10 Hz."""
 BYTES_PER_OBJECT = 32
-"""Eight float32."""
+"""Encoded size of one object: eight float32 numbers [bytes]."""
 
 _MAGIC = b"CBVG"
 _HEADER = struct.Struct("<4sBBHId")
 _ORIGIN = struct.Struct("<2d")
-_ORIGIN_GRID = 1024.0  # origins are multiples of it [m]
-_TOLERANCE = 1e-3  # of a position after the round trip [m]
+_ORIGIN_GRID = 1024.0  # origins are multiples of this [m]
+_TOLERANCE = 1e-3  # largest position error after encoding and decoding [m]
 _CHECKSUM = struct.Struct("<I")
 _NO_TRACK_ID, _OWN_VEHICLE = -1, -2
-_LARGEST_YAW = np.float32(np.pi)  # a little above pi: what the angles next to pi round to
+_LARGEST_YAW = np.float32(np.pi)  # slightly above pi: the float32 value to which angles near pi are rounded
 
 
 class MessageError(ValueError):
-    """A message that cannot be sent, or bytes that are not a whole, undamaged message of a known version."""
+    """A message that cannot be encoded, or bytes that are not a complete, intact message of a known version."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectMessage:
-    """What one agent saw at one time.
+    """Objects that one agent observed at one time.
 
     Attributes:
         agent_id: the sender; printable characters, 1 to 64 bytes of UTF-8.
         time: time stamp of the boxes [s], finite.
         frame: the sender's frame count, 0 to 2^32 - 1.
-        boxes: the objects, in the sender's own LiDAR frame. Scores and labels stay behind when the message is encoded.
+        boxes: the objects, in the sender's own LiDAR frame. Scores and labels are not encoded.
         body: one-row box of the sender's own vehicle in the same frame, or None.
 
     Raises:
-        MessageError: a field is outside of its limits; it names the field.
+        MessageError: a field is out of range; the error names the field.
     """
 
     agent_id: str
@@ -124,12 +125,12 @@ class ObjectMessage:
 
 
 def encoded_size(n_objects: int, agent_id: str) -> int:
-    """Bytes that a message of `agent_id` with `n_objects` takes: `len(encode(message))` without encoding.
+    """Return the encoded size of a message [bytes], without encoding it.
 
-    The own vehicle counts as an object.
+    The sender's own vehicle, if sent, counts as one of the `n_objects`.
 
     Raises:
-        MessageError: more objects or a longer agent id than a message holds.
+        MessageError: too many objects, or an invalid agent id.
     """
     if not 0 <= n_objects <= MAX_OBJECTS:
         raise MessageError(f"n_objects must be from 0 to {MAX_OBJECTS}, got {n_objects}")
@@ -137,12 +138,12 @@ def encoded_size(n_objects: int, agent_id: str) -> int:
 
 
 def encode(message: ObjectMessage) -> bytes:
-    """The bytes of a message, in the layout that this module's docstring describes.
+    """Encode a message in the layout described in this module's docstring.
 
     Raises:
-        MessageError: a track id is negative or above 2^24, a position would arrive more than 1 mm off (the objects
-            spread over more than 16 km), or a size does not survive as float32; names field and row. What is encoded
-            always decodes.
+        MessageError: a track id is negative or above 2^24, the rounding error of a position exceeds 1 mm (objects more
+            than 16 km apart), or a size is zero or infinite in float32; the error names field and row. Every message
+            that is encoded can be decoded.
     """
     agent_id = _agent_id_bytes(message.agent_id)
     origin = _origin_of(message.boxes)
@@ -157,10 +158,11 @@ def encode(message: ObjectMessage) -> bytes:
 
 
 def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
-    """The message in these bytes.
+    """Decode a message.
 
     Raises:
-        MessageError: these are not exactly one undamaged message of a known version with valid boxes; it says why.
+        MessageError: the bytes are not exactly one intact message of a known version with valid boxes; the error gives
+            the reason.
     """
     if not isinstance(data, (bytes, bytearray, memoryview)):
         raise MessageError(f"a message is bytes, got {type(data).__name__}")
@@ -183,10 +185,10 @@ def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
     objects_start = objects_end - BYTES_PER_OBJECT * n_objects
     if len(data) != expected:
         what = "truncated" if len(data) < expected else "oversized"
-        raise MessageError(f"{what}: {len(data)} bytes, the header ({n_objects} objects) announces {expected}")
+        raise MessageError(f"{what}: {len(data)} bytes, the header ({n_objects} objects) requires {expected}")
     if zlib.crc32(data[:objects_end]) != _CHECKSUM.unpack_from(data, objects_end)[0]:
         raise MessageError("corrupted: the checksum does not match")
-    # From here on the bytes are as they were sent, and only a sender's mistake can be wrong with them.
+    # The checksum matches, so any error found below was made by the sender.
     try:
         agent_id = data[objects_start - id_length : objects_start].decode("utf-8")
     except UnicodeDecodeError as error:
@@ -205,18 +207,18 @@ def decode(data: bytes | bytearray | memoryview) -> ObjectMessage:
 
 
 def _count(message: ObjectMessage) -> int:
-    """Objects of a message, the own vehicle included."""
+    """Return the number of objects in a message, including the own vehicle."""
     return len(message.boxes) + (message.body is not None)
 
 
 def _size(version: int, id_length: int, n_objects: int) -> int:
-    """Bytes of a message of this version."""
+    """Return the size of a message of this version [bytes]."""
     header = _HEADER.size + (_ORIGIN.size if version > 1 else 0)
     return header + id_length + BYTES_PER_OBJECT * n_objects + _CHECKSUM.size
 
 
 def _agent_id_bytes(agent_id: str) -> bytes:
-    """UTF-8 of a valid agent id; printable only, because ids end up in logs, tables and file names."""
+    """Encode an agent id as UTF-8. Ids must be printable, because logs, tables and file names contain them."""
     if not isinstance(agent_id, str):
         raise MessageError(f"agent_id must be a string, got {agent_id!r}")
     if not agent_id.isprintable():  # also refuses lone surrogates, which UTF-8 cannot hold
@@ -228,7 +230,7 @@ def _agent_id_bytes(agent_id: str) -> bytes:
 
 
 def _origin_of(boxes: Boxes) -> FloatArray:
-    """(2,) median x, y [m], which one far object does not move, on a grid: the sender's own origin if that is near."""
+    """Return the (2,) median position x, y [m], rounded to the grid of origins."""
     if not len(boxes):
         return np.zeros(2)
     median = np.sort(boxes.center[:, :2], axis=0)[(len(boxes) - 1) // 2]
@@ -237,10 +239,10 @@ def _origin_of(boxes: Boxes) -> FloatArray:
 
 
 def _checked_table(boxes: Boxes, origin: FloatArray, name: str) -> Float32Array:
-    """The table of boxes that arrive as they are sent; MessageError where float32 does not hold them."""
+    """Return the table of the boxes; MessageError if float32 cannot represent them accurately."""
     table = _table_of(boxes, origin)
     try:
-        arrived = _boxes_of(table, origin)  # a size may round to zero, a coordinate to infinity: to be refused here
+        arrived = _boxes_of(table, origin)  # a size rounded to zero or a coordinate rounded to infinity is invalid
     except ValueError as error:
         raise MessageError(f"{name} do not fit float32: {error}") from None
     error_m = np.abs(arrived.center - boxes.center).max(axis=1, initial=0.0)
@@ -248,22 +250,22 @@ def _checked_table(boxes: Boxes, origin: FloatArray, name: str) -> Float32Array:
         row = int(error_m.argmax())
         raise MessageError(
             f"{name} do not fit float32: center: row {row} is {boxes.center[row].tolist()}, too far from the "
-            f"other objects around {origin.tolist()}: it would arrive {error_m[row]:.2g} m off"
+            f"other objects around {origin.tolist()}: its rounding error would be {error_m[row]:.2g} m"
         )
     return table
 
 
 def _without_track_id(table: Float32Array) -> Float32Array:
-    """The same rows, with -1 in place of the track id."""
+    """Return a copy of the rows with -1 in place of the track id."""
     plain = table.copy()
     plain[:, 7] = _NO_TRACK_ID
     return plain
 
 
 def _table_of(boxes: Boxes, origin: FloatArray) -> Float32Array:
-    """(N, 8) little-endian float32: x and y from the origin, z, l, w, h, yaw, track id."""
+    """Return (N, 8) little-endian float32: x and y relative to the origin, z, l, w, h, yaw, track id."""
     table = np.empty((len(boxes), 8), dtype="<f4")
-    with np.errstate(over="ignore", under="ignore"):  # what overflows or vanishes is refused by name afterwards
+    with np.errstate(over="ignore", under="ignore"):  # `_checked_table` reports overflow and underflow
         table[:, 0:2] = boxes.center[:, :2] - origin
         table[:, 2] = boxes.center[:, 2]
         table[:, 3:6] = boxes.size
@@ -274,7 +276,7 @@ def _table_of(boxes: Boxes, origin: FloatArray) -> Float32Array:
 
 
 def _sendable(track_id: IntArray) -> IntArray:
-    """These track ids, all of which float32 holds exactly."""
+    """Return the track ids; MessageError if one is not from 0 to 2^24."""
     wrong = (track_id < 0) | (track_id > MAX_TRACK_ID)
     if wrong.any():
         row = int(wrong.argmax())
@@ -285,8 +287,8 @@ def _sendable(track_id: IntArray) -> IntArray:
 
 
 def _boxes_of(sent: Float32Array, origin: FloatArray) -> Boxes:
-    """The boxes of an (N, 8) table; ValueError with field and row where they are not valid."""
-    with np.errstate(invalid="ignore"):  # a signalling NaN would warn here; Boxes refuses it by name
+    """Return the boxes of an (N, 8) table; ValueError with field and row if they are invalid."""
+    with np.errstate(invalid="ignore"):  # a signalling NaN would warn here; `Boxes` rejects it
         table = sent.astype(np.float64)
     table[:, 0:2] += origin
     track_id = table[:, 7]

@@ -66,7 +66,7 @@ def _mark(used: bool) -> str:
 ABLATION = Experiment(
     "ablation",
     "Ablation (the paper's Table 3)",
-    "BEVGlue without the spatial relations between objects, and without what it knows of earlier frames.",
+    "BEVGlue without the spatial relations between objects, and without information from earlier frames.",
     _conditions,
     _tables,
 )

@@ -53,7 +53,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
 ATTACK_TABLE = Experiment(
     "attack",
     "Localisation attack (the paper's Table 2)",
-    "Spoofed satellites make every collaborator believe it is where the ego is.",
+    "Spoofed satellite signals give every collaborator the ego's position as its own.",
     _conditions,
     _tables,
 )

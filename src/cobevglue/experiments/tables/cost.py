@@ -71,14 +71,14 @@ def _time(scope: Scope, results: Results, dataset: str) -> list[Table]:
 COMMUNICATION = Experiment(
     "communication",
     "Communication",
-    "What each method sends when nothing is disturbed.",
+    "Bytes that each method sends without disturbances.",
     _conditions,
     _communication,
 )
 TIME = Experiment(
     "time",
     "Computation time",
-    "Where a frame's time goes.",
+    "Computation time of each stage in one frame.",
     _conditions,
     _time,
 )
