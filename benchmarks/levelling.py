@@ -39,7 +39,7 @@ def level_SE3_other(z: float, roll: float, pitch: float) -> FloatArray:
 
 def objects(seed: int) -> None:
     """Errors of z, roll and pitch over the number of objects."""
-    print("| objects | z: RMS error [m] | roll [°] | pitch [°] | mean NEES (3 if consistent) | roll, pitch observable |")
+    print("| objects | z: RMS error [m] | roll [°] | pitch [°] | mean NEES (3) | roll, pitch observable |")
     print("|---|---|---|---|---|---|")
     for n in (1, 2, 3, 4, 6, 8, 12, 20):
         errors, nees, observable = [], [], []
@@ -65,8 +65,8 @@ def objects(seed: int) -> None:
 
 def mast(seed: int, scenes: int = 6) -> None:
     """Planar errors with a pitched mast as the other agent."""
-    print("| pitch of the mast [°] | aligned as | accepted | planar error as aligned: median, 90 % [m] | corrected [m] ", end="")
-    print("| heights of the boxes, last 2 s: RMS error [m] | pitch, last frame: RMS error [°] |")
+    print("| pitch of the mast [°] | aligned as | accepted | planar error as aligned: median, 90 % [m] ", end="")
+    print("| corrected [m] | heights of the boxes, last 2 s: RMS error [m] | pitch, last frame: RMS error [°] |")
     print("|---|---|---|---|---|---|---|")
     seeds = [s for s in range(seed, seed + 100) if isinstance(list(scene_of("mast", s).agents.values())[1], Mast)]
     sequences = [(s, scene_sequence("mast", s, duration=4.0)) for s in seeds[:scenes]]
@@ -107,7 +107,7 @@ def v2v4real(_: int) -> None:
     if not (DATA / "v2v4real_detections").exists():
         print(f"no {DATA / 'v2v4real_detections'}: left out")
         return
-    print("| sequences | pairs | centres: std about a plane [m] | bottoms [m] | slope along x: mean ± std of frames [°] |")
+    print("| sequences | pairs | centres: std about a plane [m] | bottoms [m] | slope along x, mean ± std [°] |")
     print("|---|---|---|---|---|")
     for split in ("train", "val"):
         residuals: dict[str, list[float]] = {"centres": [], "bottoms": []}

