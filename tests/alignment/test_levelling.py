@@ -159,7 +159,7 @@ def test_covariance_is_consistent() -> None:
         rng = np.random.default_rng([2, 0, index])
         truth = rng.normal(0.0, (config.z_std, config.tilt_std, config.tilt_std))
         places = rng.uniform((0.0, -15.0), (40.0, 15.0), (int(rng.integers(3, 15)), 2))
-        found = estimate_levelling(*views(places, *truth, rng), config)
+        found = estimate_levelling(*views(places, truth[0], truth[1], truth[2], rng), config)
         error = state(found) - truth
         nees.append(error @ np.linalg.solve(found.covariance, error))
         rotation, shift = oracle(*truth)

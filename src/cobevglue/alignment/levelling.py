@@ -207,7 +207,8 @@ def _levelling(mean: FloatArray, covariance: FloatArray, pairs: int, config: Lev
     std = np.sqrt(covariance.diagonal())
     z, roll, pitch = std < _OBSERVABLE * np.array([config.z_std, config.tilt_std, config.tilt_std])
     enough = pairs >= _FEWEST_PAIRS
-    return Levelling(*mean.tolist(), covariance, (bool(z), bool(roll and enough), bool(pitch and enough)), pairs)
+    observable = bool(z), bool(roll and enough), bool(pitch and enough)
+    return Levelling(float(mean[0]), float(mean[1]), float(mean[2]), covariance, observable, pairs)
 
 
 def _matched_centers(ego: Boxes, other: Boxes, alignment: Alignment) -> tuple[FloatArray, FloatArray]:
@@ -267,4 +268,5 @@ def _fit(
             break
         largest = float(residual @ residual) if scale == np.inf else scale
         scale = max(config.outlier**2, 0.5 * largest)
-    return state, np.linalg.inv(information)
+    left: FloatArray = np.linalg.inv(information)
+    return state, left
