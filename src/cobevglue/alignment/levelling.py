@@ -268,5 +268,4 @@ def _fit(
             break
         largest = float(residual @ residual) if scale == np.inf else scale
         scale = max(config.outlier**2, 0.5 * largest)
-    left: FloatArray = np.linalg.inv(information)
-    return state, left
+    return state, np.asarray(np.linalg.inv(information), dtype=np.float64)
