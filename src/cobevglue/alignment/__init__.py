@@ -12,6 +12,7 @@ from cobevglue.alignment.config import AffinityConfig, BEVGlueConfig
 from cobevglue.alignment.given import GivenLocalisation
 from cobevglue.alignment.group import GroupAligner, Observation, Pairwise
 from cobevglue.alignment.hypotheses import PoseHypothesis
+from cobevglue.alignment.levelling import Levelling, LevellingConfig, LevellingFilter, estimate_levelling
 from cobevglue.alignment.max_consensus import MaximumConsensus
 from cobevglue.alignment.pose_graph import CoAlign
 from cobevglue.alignment.registration import ICP2D, ICP3D, FPFHTeaser
@@ -27,8 +28,12 @@ __all__ = [
     "BEVGlueConfig",
     "BEVGlueGroup",
     "GroupAligner",
+    "Levelling",
+    "LevellingConfig",
+    "LevellingFilter",
     "Observation",
     "PoseHypothesis",
+    "estimate_levelling",
     "group_aligner",
 ]
 
