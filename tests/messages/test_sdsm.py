@@ -288,7 +288,7 @@ def test_object_message_and_back() -> None:
         ({"boxes": boxes(score=[0.5, 1.5])}, "score: row 1 is 1.5, an SDSM holds scores from 0 to 1"),
         ({"velocity": [(0, 0), (300, 0)]}, "velocity along yaw: row 1 .* at most 163.8"),
         ({"measurement_offset": [0, 5]}, "measurement_offset: row 1 is 5.0, an SDSM holds at most 1.5"),
-        ({"body": BODY.replace(center=[(9, 0, 0)])}, "body must stand on the origin"),
+        ({"body": BODY.replace(center=[(9, 0, 0)])}, "body must be located at the origin"),
     ],
 )
 def test_what_would_arrive_wrong_is_refused(changes: dict[str, Any], expected: str) -> None:

@@ -41,7 +41,7 @@ class Columns:
             MessageError: it does not stand on the origin.
         """
         if not covers_origin(body)[0]:
-            raise MessageError("body must stand on the origin of the frame, the reference position")
+            raise MessageError("body must be located at the origin of the frame, the reference position")
         boxes = self.boxes
         row = body.replace(
             score=None if boxes.score is None else [0.0],

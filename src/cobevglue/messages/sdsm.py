@@ -297,7 +297,7 @@ def _objects(columns: Columns, heading: float) -> list[dict[str, Any]]:
         outside = (boxes.score < 0) | (boxes.score > 1)
         if outside.any():
             row = int(outside.argmax())
-            raise MessageError(f"score: row {row} is {boxes.score[row]}, an SDSM holds scores from 0 to 1")
+            raise MessageError(f"score: row {row} is {boxes.score[row]}, an SDSM holds scores from 0 to 1 only")
         confidences = rounded(100.0 * boxes.score)
     assert boxes.track_id is not None
     objects = []
