@@ -100,8 +100,12 @@ def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str, base: 
             axes.axhline(ap, color=color, linestyle="--", linewidth=1.4, label=f"{label} (nothing sent)")
         if (sizes > 0).any():
             marker: dict[str, Any] = {"marker": "*" if ours else _MARKERS[number % len(_MARKERS)]}
-            marker |= {"markersize": 15.0 if ours else 8.0, "markeredgecolor": "white", "zorder": 4.0 if ours else 3.0}
-            axes.plot(sizes[sizes > 0], values[sizes > 0], color=color, linewidth=1.2, label=label, **marker)
+            marker |= {"markersize": 15.0 if ours else 8.0, "zorder": 4.0 if ours else 3.0}
+            # CoBEVGlue itself is filled, its variants are hollow; they share the marker.
+            variant = ours and "," in label
+            marker |= {"markeredgecolor": color, "markerfacecolor": "white"} if variant else {"markeredgecolor": "white"}
+            style = "--" if variant else "-"
+            axes.plot(sizes[sizes > 0], values[sizes > 0], style, color=color, linewidth=1.2, label=label, **marker)
     axes.set_xscale("log", base=base)
     axes.set_xlabel("communication [bytes a frame]")
     _finish(figure, axes, title)
