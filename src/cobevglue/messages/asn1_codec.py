@@ -21,11 +21,9 @@ class Codec:
 
     Attributes:
         path: of the file.
-        check_received: whether `decode` refuses numbers beyond their limits, which the bits of some types can hold.
     """
 
     path: Path
-    check_received: bool = False
 
     def encode(self, name: str, value: Any) -> bytes:
         """Encode a value of the type of this name.
@@ -48,14 +46,13 @@ class Codec:
         """Decode a value of the type of this name; bytes behind it are ignored.
 
         Raises:
-            MessageError: the bytes do not start with the encoding of a value of the type.
+            MessageError: the bytes do not start with the encoding of a value of the type, or a number is beyond
+                its limits (the bits of some types can hold such numbers).
         """
         specification = _specification(self.path)
         try:
-            return specification.decode(name, data, check_constraints=self.check_received)
-        except (
-            Exception
-        ) as error:  # asn1tools raises whatever its own code runs into: IndexError, KeyError, OverflowError
+            return specification.decode(name, data, check_constraints=True)
+        except Exception as error:  # asn1tools lets errors of its own code through: IndexError, KeyError, OverflowError
             raise MessageError(f"not a {name}: {type(error).__name__}: {error}") from None
 
     def has_spare_bytes(self, name: str, data: bytes) -> bool:
@@ -72,7 +69,7 @@ class Codec:
 
 CPM = Codec(Path(__file__).with_name("cpm.asn"))
 """ETSI's types."""
-SDSM = Codec(Path(__file__).with_name("sdsm.asn"), check_received=True)
+SDSM = Codec(Path(__file__).with_name("sdsm.asn"))
 """SAE's types."""
 
 

@@ -103,7 +103,9 @@ def ap_over_bytes(points: Sequence[tuple[str, float, float]], title: str, base: 
             marker |= {"markersize": 15.0 if ours else 8.0, "zorder": 4.0 if ours else 3.0}
             # CoBEVGlue itself is filled, its variants are hollow; they share the marker.
             variant = ours and "," in label
-            marker |= {"markeredgecolor": color, "markerfacecolor": "white"} if variant else {"markeredgecolor": "white"}
+            marker |= (
+                {"markeredgecolor": color, "markerfacecolor": "white"} if variant else {"markeredgecolor": "white"}
+            )
             style = "--" if variant else "-"
             axes.plot(sizes[sizes > 0], values[sizes > 0], style, color=color, linewidth=1.2, label=label, **marker)
     axes.set_xscale("log", base=base)
