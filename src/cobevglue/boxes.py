@@ -117,7 +117,7 @@ class Boxes:
 
 
 def covers_origin(boxes: Boxes) -> BoolArray:
-    """(N,) whether a box, seen from above, stands on the origin of its frame: in a LiDAR's frame, its carrier does."""
+    """(N,) whether a box covers the origin of its frame in bird's-eye view, as the sensor's own vehicle does."""
     c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
     x, y = boxes.center[:, 0], boxes.center[:, 1]
     covers: BoolArray = (2 * abs(c * x + s * y) < boxes.size[:, 0]) & (2 * abs(c * y - s * x) < boxes.size[:, 1])

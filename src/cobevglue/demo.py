@@ -338,7 +338,7 @@ def _poses(views: Mapping[str, LidarView]) -> dict[str, FloatArray]:
 def _workers() -> Iterator[Executor]:
     """Threads for what can be done at the same time.
 
-    Meanwhile the network is not spread over threads of its own: on a busy machine they mostly wait for each other.
+    The network uses one thread meanwhile: on a busy machine several would mostly wait for each other.
     """
     with torch_threads(1), ThreadPoolExecutor(min(_WORKERS_AT_MOST, os.cpu_count() or 1)) as workers:
         yield workers

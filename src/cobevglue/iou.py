@@ -35,8 +35,8 @@ def bev_iou(a: Boxes, b: Boxes) -> FloatArray:
 def bev_giou(a: Boxes, b: Boxes, max_distance: float = math.inf) -> FloatArray:
     """Generalised IoU (Rezatofighi et al., CVPR 2019) of every pair, seen from above.
 
-    IoU minus the share of the two boxes' convex hull that neither covers, so it still tells near from far when boxes
-    do not overlap.
+    IoU minus the share of the two boxes' convex hull that neither covers, so that it still depends on the distance
+    when boxes do not overlap.
 
     Args:
         a: N boxes.

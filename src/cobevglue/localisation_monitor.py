@@ -1,17 +1,17 @@
-"""Integrity monitoring of claimed poses: is what GNSS says consistent with what the agents' objects say?
+"""Integrity monitoring of claimed poses: are GNSS poses consistent with the agents' objects?
 
     monitor = LocalisationMonitor()
     report = monitor.update(time, claimed, alignments, ego="car1")
     report.alarm            # a claimed pose is false
-    report.faulty           # whose, as far as that can be told
+    report.faulty           # whose, if it can be attributed
     report.prior("car2")    # the claimed relative pose with its covariance for `BEVGlue.align`, or None
 
 For every pair of agents, the difference of the claimed and the aligned relative pose goes through a Kalman filter. Its
 state is the error of the claims, and honest errors are first-order Gauss-Markov processes: as large as the claimed
-covariance says, and correlated over `correlation_time`, as GNSS errors are. Two sequential tests find false claims:
+covariance, and correlated over `correlation_time`, as GNSS errors are. Two sequential tests find false claims:
 
-- *jump*: a CUSUM of the normalised innovations squared (Page, "Continuous Inspection Schemes", 1954). What one frame
-  adds is bounded, so that a single wrong alignment cannot raise the alarm;
+- *jump*: a CUSUM of the normalised innovations squared (Page, "Continuous Inspection Schemes", 1954). The
+  increment of a frame is bounded, so that a single wrong alignment cannot raise the alarm;
 - *offset*: the error by the filter, in standard deviations of the claim. It finds slow drifts.
 
 Agents at fault are the smallest set without which all pairs agree, if there is one such set and it is a minority.
@@ -113,7 +113,7 @@ class LocalisationReport:
         time: of the frame [s].
         ego: name of the ego.
         pairs: the test of every pair that could be tested, in this frame or within `max_gap` before.
-        faulty: agents whose claims are false. Empty where that cannot be told, as for two agents.
+        faulty: agents whose claims are false. Empty if they cannot be attributed, as for two agents.
         claims: by agent, (3,) of the claimed world_SE2_agent and its (3, 3) covariance.
     """
 

@@ -3,7 +3,7 @@
     detector = MisbehaviourDetector()          # one per collaborator
     report = detector.update(ego_boxes, other_boxes, alignment, time)
     if report.misbehaving: ...                 # send report.as_dict()
-    if report.exclude: ...                     # sure: leave this agent out of fusion
+    if report.exclude: ...                     # leave this agent out of fusion
 
 Plain view is within `max_range` of the observer and not hidden behind boxes that both sides can check. Every object
 counts once, whatever the number of frames, as what one detector does not see it does not see for long. Of N objects
@@ -63,8 +63,8 @@ class MisbehaviourConfig(Settings):
         frames: objects count once they were in plain view so often.
         contradicted: and are missing if they were missing in this share of the frames.
         memory: objects count until they were out of view so long [s].
-        evidence: of misbehaviour from here on: the log-likelihood ratio [nats].
-        exclusion: from here on it is sure, and the agent is to be left out of fusion [nats].
+        evidence: threshold of the log-likelihood ratio for reporting misbehaviour [nats].
+        exclusion: threshold for excluding the agent from fusion [nats].
         objects: and at least so many missing objects.
         displaced: an invented object has a removed one within this, and is a displaced one [m].
         repeats: lists sent before, in `history`, that make a replay.
@@ -120,7 +120,7 @@ class MisbehaviourReport:
         observations: what speaks against the agent; none in a report on an agent without misbehaviour.
         invented: evidence for invented objects so far [nats].
         removed: evidence for removed objects so far [nats].
-        exclude: whether the detector is sure: the agent is to be left out of fusion.
+        exclude: whether the agent should be excluded from fusion.
         tested: number of the other's objects in the ego's plain view, and of the ego's in the other's.
     """
 
@@ -133,7 +133,7 @@ class MisbehaviourReport:
 
     @property
     def misbehaving(self) -> bool:
-        """Whether there is something to report."""
+        """Whether the report has observations."""
         return bool(self.observations)
 
     def as_dict(self, agent: str) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class MisbehaviourReport:
 
 @dataclass(slots=True)
 class _Object:
-    """How often an object was in plain view of the one who does not report it, and how often missing there."""
+    """Number of frames with an object in plain view of the other agent, and of those without a report of it."""
 
     last: float
     seen: int = 0
@@ -287,8 +287,8 @@ class MisbehaviourDetector:
                 observations.append(Observation(label, 4, evidence, tuple(sorted(absent)), share))
         if self._repeats >= config.repeats:
             observations.append(Observation("ObjectList-Replayed", 2, np.inf, (), 1.0))
-        sure = any(o.evidence >= config.exclusion for o in observations)
-        return MisbehaviourReport(now, tuple(observations), evidences[0], evidences[1], (tested[0], tested[1]), sure)
+        exclude = any(o.evidence >= config.exclusion for o in observations)
+        return MisbehaviourReport(now, tuple(observations), evidences[0], evidences[1], (tested[0], tested[1]), exclude)
 
 
 def share_evidence(missing: BoolArray, probability: FloatArray) -> tuple[float, float]:

@@ -81,7 +81,7 @@ class ObjectCollaboration:
         times: Mapping[str, float] | None = None,
         bodies: Mapping[str, Boxes] | None = None,
     ) -> FusedObjects:
-        """The ego's next list, and the newest list of every other agent.
+        """Process the ego's next list, and the newest list of every other agent.
 
         Args:
             objects: of every agent, in its own frame.
@@ -89,8 +89,8 @@ class ObjectCollaboration:
             time: of the ego's list [s]; by default 0.1 s after the last step.
             times: time stamp of each list that has one of its own [s], on any clock. A list with the time stamp of the
                 agent's last one is that list again: its tracks are kept.
-            bodies: one-row box of the own vehicle of each agent that knows it, in its own frame. It is an object to the
-                others, and fused as one.
+            bodies: one-row box of the own vehicle of each agent that knows it, in its own frame. The others observe
+                it as an object, and it is fused as one.
 
         Raises:
             ValueError: no such ego, a body that has not one row, or a time that is not later than the last (of the ego)

@@ -53,7 +53,7 @@ class StepOutput:
 class CoBEVGlue:
     """Collaborative perception of several agents (equation 1 of the paper).
 
-    All agents run the same detector; each has a tracker of its own. Agents may come and go from frame to frame.
+    All agents run the same detector; each has its own tracker. Agents may appear and disappear between frames.
 
     Args:
         detector: from points to features and boxes.

@@ -48,8 +48,8 @@ ALIGNERS: dict[str, type[Aligner] | type[GroupAligner]] = {
     "fpfh-teaser": FPFHTeaser,
     "v2vnet-robust": V2VNetRobustPoses,
 }
-"""From the name users type to the class: an `Aligner` looks at the boxes of two agents, a `GroupAligner` at what it
-says it needs of all of them."""
+"""From the name users type to the class: an `Aligner` uses the boxes of two agents, a `GroupAligner` what its
+`needs` lists, of all agents."""
 
 
 def group_aligner(name: str, **options: Any) -> GroupAligner:

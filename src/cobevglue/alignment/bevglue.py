@@ -59,8 +59,8 @@ class BEVGlue:
     ) -> Alignment:
         """The relative pose in this frame, or a refusal with its reason.
 
-        An agent's own vehicle is an object to the other agent, which no detector of its own reports. Where it is given,
-        it takes part like any box, and a pose that places one vehicle into the other is refused. The paper's method
+        An agent's own vehicle is an object for the other agent, but missing from the agent's own detections. If given,
+        it is matched like any box, and a pose that places one vehicle into the other is refused. The paper's method
         uses none of the keyword arguments.
 
         Args:

@@ -107,7 +107,7 @@ class GroupAligner(ABC):
         return parts
 
     def decode(self, parts: Mapping[str, bytes], observation: Observation) -> Observation:
-        """The observation decoded from messages; fields that do not travel come from `observation`."""
+        """The observation decoded from messages; fields that are not transmitted come from `observation`."""
         received: dict[str, Any] = {name: decode_arrays(data)[name] for name, data in parts.items() if name != "boxes"}
         if "boxes" in parts:
             message = decode(parts["boxes"])

@@ -75,7 +75,7 @@ class Levelling:
         roll: rotation about the other's x axis [rad], left side up if positive.
         pitch: rotation about the y axis of the level frame [rad], front down if positive.
         covariance: (3, 3) of z, roll and pitch [m, rad, rad]; that of the prior where nothing is known.
-        observable: of z, roll and pitch, whether the heights tell it. What is not observable is near 0, its prior.
+        observable: whether the heights determine z, roll and pitch. An unobservable component is near 0, its prior.
         pairs: how many matched pairs with known heights were used.
     """
 

@@ -3,7 +3,7 @@
 Yuan et al., "Keypoints-Based Deep Feature Fusion for Cooperative Vehicle Detection of Autonomous Driving" (RA-L 2022),
 section III: a grid around the claimed relative pose is searched for the maximum consensus, and the boxes that agree
 give the pose by least squares. The paper also matches poles, walls and fences, which its network segments; our
-detector knows vehicles only, and so there is less to agree on.
+detector finds vehicles only, so fewer objects are available.
 
 How far to search and how many have to agree were chosen on simulated drives of the split "validation" (16 frames, three
 agents each, this project's detector): with noise of 0.5, 1 and 2.5 (m and degrees, on every agent) 0.92, 0.95 and 0.89

@@ -228,8 +228,8 @@ def _correct(h, star, correlation) -> None:
     for i in range(3):
         surprise += innovation[i] ** 2 / (cov[i, i] + variance[i]) / 3.0
     if surprise > _SURPRISE and star.pairs >= _FEWEST_TO_OVERRULE:
-        # The motion model is wrong at the moment (braking, steering): believe what is seen. Of two or three pairs one
-        # may be a coincidence, which must not turn a pose that was right.
+        # The motion model is wrong at the moment (braking, steering): trust the measurement. Of two or three pairs one
+        # may be a coincidence, which must not rotate a pose that was right.
         for i in range(6):
             for j in range(6):
                 cov[i, j] *= surprise / _SURPRISE
@@ -301,7 +301,7 @@ def _follow(h, ego, other, sizes, star, pairs, noise, rounds) -> None:
 
 @kernel(error_model="numpy")
 def _surviving_pairs(h, ego_ids, other_ids, pairs) -> int:
-    """Write the rows of the track pairs matched last time that both agents still track; how many there are."""
+    """Write the rows of the track pairs matched last time that both agents still track; returns their number."""
     count = 0
     for k in range(h.tracked_pairs):
         for m in range(len(ego_ids)):

@@ -42,11 +42,11 @@ _MOST_AGE = 0.5
 _TURN_TIME = 3.0
 """Time after which the turn rate of a vehicle is another one [s]."""
 _FEWEST_DETECTIONS = 3
-"""Detections that it takes to tell a velocity: of two, one is often another object."""
+"""Minimum number of detections for a velocity: of two, one is often another object."""
 _OTHER_OBJECT = 25.0
 """Squared innovation, in variances, above which a track id is another object now."""
 _FEWEST_ANCHORS = 3
-"""Tracks that it takes to tell the motion of the frame from theirs."""
+"""Minimum number of tracks for estimating the motion of the frame from theirs."""
 _WIDEST_SCALE, _NARROWEST_SCALE = 64.0, 4.0
 """Squared velocity, in variances, at which a track counts a quarter in the common motion: first and last."""
 _ANCHOR_PRIOR = (5.0, 5.0, 0.3)
@@ -128,7 +128,7 @@ def _fit_common_motion(tracks, count):
     """The rigid motion (vx, vy, turn rate) that most of `count` tracks share over ground.
 
     Graduated non-convexity with a Geman-McClure weight: the scale falls from all tracks to those within the noise, so
-    that the largest group that moves as one decides and not the mean of all.
+    that the largest group with a common motion decides and not the mean of all.
 
     Args:
         tracks: `TRACK` records.

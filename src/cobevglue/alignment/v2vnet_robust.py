@@ -113,7 +113,7 @@ def robust_mean(poses: Sequence[SE2], weights: FloatArray) -> SE2:
     """The centre of Student's t distribution that fits some poses best, found by expectation maximisation.
 
     A pose is a point in four dimensions: x, y, and where the heading points to, 10 m away. All four have one variance:
-    the paper has a covariance, but two to six points, one of which may be wrong, do not tell so much.
+    the paper has a covariance, which two to six points, one of which may be wrong, do not determine.
 
     Args:
         poses: K of them, in one frame.

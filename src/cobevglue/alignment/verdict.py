@@ -1,7 +1,7 @@
 """The verdict: the probability that a pose is wrong.
 
-The hypotheses of the filter and "the two agents have nothing in common" are taken for all there is: their evidences,
-as log-likelihoods, make a posterior. A right hypothesis may still be imprecise, so the probability that it lands boxes
+The hypotheses of the filter and "the two agents have nothing in common" are taken as exhaustive: their evidences, as
+log-likelihoods, give the posterior. A right hypothesis may still be imprecise, so the probability that it lands boxes
 farther off than the tolerance is added.
 """
 
@@ -58,7 +58,8 @@ def judge(
         return Verdict(1.0, "no object in this frame supports the pose followed so far")
     chance = _likelihood(config.chance_evidence - evidence)
     # Where a different pose has much evidence, too, the pattern is regular, and the agents may see different parts of
-    # what looks alike: then the margin only tells which parts. One frame cannot know; frames in which things move can.
+    # what looks alike: then the margin only decides between these parts. A single frame cannot exclude that; frames in
+    # which objects move can.
     alike = config.self_similarity * (1.0 + 1.0 / frames) * max(evidence - margin, 0.0)
     second = _likelihood(alike - margin)
     # The frame may have moved otherwise than the hypothesis expects. Then another pose explains this frame far better

@@ -128,7 +128,7 @@ class Frame:
             agent: name of an agent.
 
         Returns:
-            One box without `track_id` in the agent's LiDAR frame; None for a roadside unit, and where nobody labels it.
+            One box without `track_id` in the agent's LiDAR frame; None for a roadside unit, and if it is not labelled.
 
         Raises:
             ValueError: unknown agent, or a malformed file.

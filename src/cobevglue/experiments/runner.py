@@ -202,7 +202,7 @@ def _start_worker(reports: Any, stop: Any) -> None:
 
 
 def _run_in_worker(job: _Job) -> ScenarioResult:
-    """In a process of its own."""
+    """Run a job in a worker process."""
     import torch
 
     torch.set_num_threads(1)

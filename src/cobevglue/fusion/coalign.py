@@ -16,7 +16,7 @@ __all__ = ["CoAlign", "ego_attention"]
 
 
 class CoAlign(MultiScaleFusion):
-    """Multi-scale intermediate fusion of the paper. It has no weights of its own.
+    """Multi-scale intermediate fusion of the paper, without parameters.
 
     Cells that an agent's map does not reach are zeros, and take part as zeros: neither this paper nor OPV2V's (Xu et
     al., ICRA 2022), which the attention is from, leaves them out.

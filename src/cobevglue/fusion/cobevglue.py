@@ -21,7 +21,7 @@ _FUSED, _EGO, _OTHER = 0.95, 0.9, 0.7
 
 
 class MaxFusion(MultiScaleFusion):
-    """Equation (1d) of CoBEVGlue: element-wise maximum at strides 2, 4 and 8. It has no weights of its own.
+    """Equation (1d) of CoBEVGlue: element-wise maximum at strides 2, 4 and 8, without parameters.
 
     The paper says nothing of noise in training. Ours makes relative poses as wrong as BEVGlue's are on drives of the
     simulated validation split: 0.1 m in x and y, 0.3 degrees.

@@ -47,7 +47,7 @@ class EarlyTeacher(MultiScaleFusion):
 
     @torch.no_grad()
     def target(self, samples: Sequence[FusionSample]) -> Tensor:
-        """(B, C, H, W) what the head of the teacher looks at: what the student's fused map should be like."""
+        """(B, C, H, W) the input of the teacher's head, the target of the student's fused map."""
         target: Tensor = self.neck(self.fused(samples))
         return target
 
@@ -117,7 +117,7 @@ class DiscoNet(SingleMapFusion):
 
 def merged_features(sample: FusionSample) -> tuple[Tensor, Tensor, Tensor] | None:
     """The encoder's maps of the points of all agents together, where they are known."""
-    # One agent's points are all there are.
+    # With a single agent, the merged cloud is its own.
     return sample.observations[0].features if len(sample.observations) == 1 else sample.early_features
 
 

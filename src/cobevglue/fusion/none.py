@@ -13,10 +13,10 @@ __all__ = ["NoCollaboration"]
 
 
 class NoCollaboration(FusionMethod):
-    """What a single agent sees: the row that collaboration has to beat."""
+    """Detections of the ego alone: the reference for all other methods."""
 
     def __init__(self, detector: PointPillars) -> None:
-        """The detector has done all there is to do."""
+        """Take the detector for the common signature; the method has no layers."""
 
     def message(self, observation: PerceptionOutput) -> Arrays:
         """Nothing."""

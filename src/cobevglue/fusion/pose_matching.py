@@ -24,15 +24,14 @@ _TEMPERATURE = 10.0
 
 
 class PoseMatching(nn.Module):
-    """Compares two maps in one frame, of which the second may be slightly out of place.
+    """Estimates the small rigid motion that aligns a second map with the first.
 
-    Every cell is embedded in a few numbers, without mean and of unit variance over the map. Patches of the first map
-    are correlated with the second, at all shifts of a few cells. A softmax over the shifts says where each patch is in
-    the second map, and how clearly it says so, times a learnt weight, is what the patch counts. The motion is the one
-    that brings all patches to their places in the sense of weighted least squares. Whether there is any to trust is
-    said by two layers on the same correlations.
+    Every cell is embedded in a few numbers, normalised to zero mean and unit variance over the map. Patches of the
+    first map are correlated with the second, at all shifts of a few cells. A softmax over the shifts gives the
+    displacement of each patch; the weight of a patch is the peak of the softmax times a learnt weight. The motion fits
+    all displacements by weighted least squares. Two layers on the same correlations give the confidence of the motion.
 
-    All of it works a little before anything is learnt, so that a thousand samples are enough to learn the rest.
+    The untrained module already gives a rough motion, so that a thousand samples are enough for training.
 
     Args:
         config: the detector's settings, for the range.
@@ -83,7 +82,7 @@ class PoseMatching(nn.Module):
             weighted: Tensor = (values * weight).sum(dim=(2, 3)) / (total + _NO_MOTION)
             return weighted
 
-        # A map is in place where much says so, the motion is small, and few patches want another one.
+        # Confidence is high if the weights are large, the motion is small, and few displacements disagree with it.
         motion, other_motions = (
             mean(m.square().sum(dim=1, keepdim=True)).detach().sqrt() for m in (fitted, moves - fitted)
         )

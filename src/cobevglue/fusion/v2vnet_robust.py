@@ -103,7 +103,7 @@ class V2VNetRobust(V2VNet):
         return terms
 
     def _sample_loss(self, maps: Tensor, sample: FusionSample, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The fused map of a sample, and the sums of the two losses over both looks at all collaborators."""
+        """The fused map of a sample, and the two losses, summed over both passes over all collaborators."""
         ego, others = self.placed(maps[:1], [SE2()], 0)[0], maps[1:]
         true = sample.true_ego_SE2_agent[1:]
         # Taking turns by the sample's number too, a single collaborator is as often strong as weak.

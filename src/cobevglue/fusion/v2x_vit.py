@@ -1,12 +1,12 @@
 """V2X-ViT (Xu et al., "V2X-ViT: Vehicle-to-Everything Cooperative Perception with Vision Transformer", ECCV 2022).
 
 Sized for a CPU: two blocks of the paper's three, fewer channels, windows of 4 and 8 cells without those of 16, which
-take as long as all the rest. Left out, as there is nothing for them to tell:
+take as long as all the rest. Omitted, because the inputs do not have the information:
 
-- Agent types. This system does not say which agents are roadside units. With one type, the heterogeneous attention's
-  matrices for each pair of types are products with those of key and value, so that nothing but these remains.
-- Delay-aware positional encoding, and the correction of where a delayed agent has moved to: all clouds of a frame are
-  of one time.
+- Agent types. The fusion methods do not receive whether an agent is a roadside unit. With one type, the heterogeneous
+  attention's matrices for each pair of types are products with those of key and value, so that only these remain.
+- Delay-aware positional encoding, and the correction for the motion of a delayed agent: all clouds of a frame have the
+  same time stamp.
 """
 
 from __future__ import annotations

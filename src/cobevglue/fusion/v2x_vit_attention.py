@@ -60,7 +60,7 @@ class MultiScaleWindowAttention(nn.Module):
 
     The larger the window, the fewer the heads and the wider each of them, as in the paper; the sizes share the channels
     (in the paper each has as many as there are). Merged by split attention (Zhang et al., "ResNeSt", 2020): each
-    channel of each agent is a mean over the sizes, weighted by what the whole map says.
+    channel of each agent is a mean over the sizes, with weights computed from the whole map.
 
     Args:
         channels: C.

@@ -102,8 +102,8 @@ class NodeResult:
 
     Attributes:
         time: time stamp of the own list [s].
-        alignments: of every other agent that is present; of one that is silent for a moment a refusal that says so.
-        objects: everyone's objects in the own frame at that time, best first.
+        alignments: of every other agent that is present; a refusal for one whose last message is too old.
+        objects: objects of all agents in the own frame at that time, sorted by score.
     """
 
     time: float

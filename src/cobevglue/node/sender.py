@@ -88,7 +88,7 @@ class Sender:
 
     Attributes:
         heard: when the last message of the current session arrived [s], on the receiver's clock.
-        lost: messages of the current session that have not arrived, as far as their numbers tell.
+        lost: messages of the current session that have not arrived, by their sequence numbers.
     """
 
     def __init__(self, header: SessionHeader | None, time: float, now: float) -> None:

@@ -61,7 +61,7 @@ def _run(
             for write in writers:
                 write(frame)
             part = _PICTURES * frame.index // total
-            if part not in shown or _telling(frame) > _telling(shown[part]):
+            if part not in shown or _informative(frame) > _informative(shown[part]):
                 shown[part] = frame
             if progress is not None:
                 progress(summary.frames, total)
@@ -100,8 +100,8 @@ def _writers(out: Path, ego: str, rerun: bool, stack: ExitStack) -> list[Callabl
     return writers
 
 
-def _telling(frame: ReplayFrame) -> tuple[int, int]:
-    """How many agents are aligned, and how many objects there are: the more, the more there is to see."""
+def _informative(frame: ReplayFrame) -> tuple[int, int]:
+    """Number of aligned agents, and of objects; the frame with most of both is shown."""
     return sum(alignment.accepted for alignment in frame.seen.alignments.values()), len(frame.seen.objects)
 
 

@@ -1,4 +1,4 @@
-"""Distributed training with `torchrun`; without it, there is one process and no communication."""
+"""Distributed training with `torchrun`; without it, one process trains and nothing is communicated."""
 
 from __future__ import annotations
 

@@ -38,10 +38,10 @@ _FEWEST_POINTS = 10
 
 
 class FPFHTeaser(PointAligner):
-    """The pose that most matched descriptors agree on; refused where too few do. It sees no pose.
+    """The pose that most matched descriptors agree on; refused where too few do. It uses no initial pose.
 
-    Only points travel, 6 bytes each: the receiver computes the descriptors of what arrived, as their 33 numbers would
-    cost many times more. It samples its own cloud on the same grid, since descriptors depend on the density. The motion
+    Only points are transmitted, 6 bytes each; the receiver computes their descriptors, whose 33 numbers would need many
+    times more bytes. It samples its own cloud on the same grid, since descriptors depend on the density. The motion
     is found in space, and its planar part is kept.
 
     Args:

@@ -102,7 +102,7 @@ class _ICP(PointAligner):
 
 
 class ICP2D(_ICP):
-    """ICP in the plane: what stands on the ground, seen from above, 4 bytes a point.
+    """Planar ICP of the points above the ground, projected to x and y, 4 bytes per point.
 
     Args:
         budget_bytes: see `PointAligner`.

@@ -16,13 +16,13 @@ from cobevglue.typing import Float32Array, FloatArray, IntArray
 __all__ = ["PointAligner", "Sketch", "height_above_ground", "one_per_voxel", "within_reach"]
 
 MIN_BUDGET = 256
-"""Bytes in which a claimed pose and no points at all fit."""
+"""Bytes of a message with a claimed pose and no points, rounded up."""
 _UNIT = 0.01
-"""Coordinates travel as whole centimetres in int16 …"""
+"""Coordinates are transmitted as whole centimetres in int16 …"""
 _REACH = 300.0
 """… and so cannot be farther than 327 m."""
 _COARSER, _COARSEST = 1.05, 140
-"""From one grid to the next, and how many there are: up to a thousandfold."""
+"""Ratio of successive grid sizes, and their number: up to a thousandfold."""
 _STREAM = 70
 
 _GROUND_RADIUS, _GROUND_BIN, _GROUND_TOLERANCES, _FEWEST_ON_GROUND = 40.0, 0.2, (1.0, 0.7, 0.5, 0.3, 0.2), 10
@@ -42,9 +42,9 @@ class Sketch(Observation):
 class PointAligner(GroupAligner):
     """Aligns by points. Those of another agent arrive sampled, so that its messages fit the budget.
 
-    The sender takes what the method looks at (`standing`), and of that one point for each voxel. If these do not fit,
-    the grid is made coarser, by 5 % each time, as long as it still has as many points as fit; what is too much then is
-    dropped at random, in the same way every time. Points travel as int16 centimetres. The ego's own cloud is not
+    The sender selects the points that the method uses (`standing`), and of these one per voxel. If they exceed the
+    budget, the grid is made coarser, by 5 % each time, as long as it still has as many points as fit; the excess is
+    then dropped at random, with a fixed seed. Points are transmitted as int16 centimetres. The ego's own cloud is not
     limited.
 
     Args:
@@ -66,7 +66,7 @@ class PointAligner(GroupAligner):
 
     @abstractmethod
     def standing(self, points: FloatArray) -> FloatArray:
-        """What the method looks at of a cloud.
+        """Select the points of a cloud that the method uses.
 
         Args:
             points: (N, 3) finite and within reach, in the agent's LiDAR frame [m].
@@ -76,7 +76,7 @@ class PointAligner(GroupAligner):
         """
 
     def sketch(self, observation: Observation, voxel: float | None = None) -> Sketch:
-        """What arrived, as it is; of another observation all that the method looks at, on a grid of this size [m].
+        """Return a received sketch unchanged; sample other observations on a grid of this size [m].
 
         Args:
             observation: of any agent.

@@ -1,7 +1,7 @@
 """The rigid motion between two sets of points of which most pairs are wrong: a solver after TEASER++, our own.
 
 Yang, Shi and Carlone, "TEASER: Fast and Certifiable Point Cloud Registration" (T-RO 2021). In its order: differences of
-positions, whose lengths no motion changes, tell which pairs agree with each other (section V); of the graph of agreeing
+positions, whose lengths no motion changes, decide which pairs are consistent (section V); of the graph of agreeing
 pairs the largest clique is kept (VI); its differences give the rotation by truncated least squares, solved by graduated
 non-convexity (Yang et al., RA-L 2020); then each component of the translation is the one that most pairs agree with
 (V-B). The motion is refitted to all pairs that agree with it, which TEASER++ leaves to the user. Nothing is certified.

@@ -56,7 +56,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         "The paper's first row is as good as no collaboration: its failed matches must have been dropped.",
     )
     notes += PAPERS if published else ()
-    return [Table("ablation", "What the matching looks at", columns, [*rows, [*alone, None, None]], notes)]
+    return [Table("ablation", "Information used by the matching", columns, [*rows, [*alone, None, None]], notes)]
 
 
 def _mark(used: bool) -> str:

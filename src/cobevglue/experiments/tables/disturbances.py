@@ -76,9 +76,9 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
 FURTHER = Experiment(
     "disturbances",
     "Further disturbances",
-    "Replayed and constantly wrong localisation, boxes that a collaborator makes up (and adds to those it "
-    "tells, not to its features), lost messages and late ones. A pose of a late message counts as right where "
-    "it is that of the time when the message was sent.",
+    "Replayed and constantly wrong localisation, fabricated boxes (added to the transmitted boxes, "
+    "not to the features), lost messages and late ones. The pose of a late message is compared with the true pose at "
+    "the time of the message.",
     _conditions,
     _tables,
 )
