@@ -41,7 +41,7 @@ def row_changed(field: str, row: int, value: Any) -> dict[str, Any]:
     return {field: column}
 
 
-def test_what_goes_in_is_what_is_there() -> None:
+def test_fields_keep_their_values() -> None:
     assert as_lists(good()) == GOOD
     assert len(good()) == 3
     assert good().center.dtype == good().size.dtype == good().yaw.dtype == np.float64

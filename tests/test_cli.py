@@ -163,7 +163,7 @@ def test_refusal_exits_3_with_reason_and_no_pose(tmp_path: Path, lists: tuple[Pa
     assert found["matches"] == []
 
 
-def test_a_refusal_says_why_in_the_table_too(
+def test_refusal_reason_is_in_the_table(
     tmp_path: Path, lists: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     nothing = tmp_path / "nothing.json"

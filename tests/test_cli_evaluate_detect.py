@@ -204,7 +204,7 @@ def test_bad_input_is_one_line(
         (["--dataset", "v2v4real"], "needs exact poses and object ids: opv2v, v2xset"),  # a data set without
     ],
 )
-def test_alignment_refuses_what_is_for_detection(
+def test_alignment_refuses_options_of_detection(
     simulated: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     assert main(["evaluate", "--root", str(simulated), *arguments]) == 2

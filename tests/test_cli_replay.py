@@ -66,7 +66,7 @@ def test_refused_in_every_frame(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "0 (0 %)" in capsys.readouterr().out
 
 
-def test_problems_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_problems_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "bag"
     with new_detection_bag(folder) as writer:
         for received, stamp in ((1.0, 1.0), (1.1, 1.1), (1.2, 1.05), (1.3, 1.1), (1.4, 1.4)):
@@ -118,7 +118,7 @@ def test_nothing_to_align(
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_without_recording_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(tmp_path / "nowhere.mcap")]) == 2
     (tmp_path / "text.mcap").write_text("hello" * 50)
     assert main(["replay", str(tmp_path / "text.mcap")]) == 2

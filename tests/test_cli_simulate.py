@@ -53,7 +53,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_what_is_written_reads_back_as_opv2v(tree: Path) -> None:
+def test_written_tree_is_valid_opv2v(tree: Path) -> None:
     made = simulated_scenario("test", 0, 5, ScenarioSettings(frames=2, roadside_units=1), NETWORK)
     read = OPV2V(tree, "test")[NAME]
     assert [frame.time for frame in read] == pytest.approx([0.0, 0.1])

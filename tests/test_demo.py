@@ -68,7 +68,7 @@ def test_hidden_vehicles_have_few_ego_points() -> None:
     assert made.hidden_movers.tolist() == [UNSEEN], "neither the parked one nor the one 63 m away"
 
 
-def test_a_verdict_tells_found_vehicles_from_ghosts() -> None:
+def test_detections_are_split_into_true_and_false() -> None:
     # Found: 10 m and (with half a metre off) 20 m. Not sure enough: the parked one. On one that does not count: 30 m.
     # Ghosts: one in the open, one that overlaps the far one too little, and a second box on the one at 10 m.
     at = [(10.0, 0.0), (20.5, 0.0), (15.0, 20.0), (30.0, -10.0), (-30.0, 0.0), (62.0, 20.0), (10.2, 0.0)]
@@ -98,7 +98,7 @@ def test_story_frame_has_most_hidden_moving_vehicles() -> None:
 # The drive
 
 
-def test_the_numbers_are_what_their_names_say(drive: DemoResult) -> None:
+def test_demo_figures_match_their_definitions(drive: DemoResult) -> None:
     summary = drive.summary()
     assert summary["frames"] == FRAMES
     assert summary["vehicles"] == pytest.approx(np.mean([frame.counted.sum() for frame in drive.frames]))
@@ -174,7 +174,7 @@ def test_the_same_seed_gives_the_same_drive() -> None:
 @pytest.mark.parametrize(
     ("seed", "frames", "what"), [(0, 0, "frames must be"), (0, 201, "frames must"), (-1, 1, "seed")]
 )
-def test_what_is_out_of_range_is_refused(seed: int, frames: int, what: str) -> None:
+def test_out_of_range_values_are_refused(seed: int, frames: int, what: str) -> None:
     with pytest.raises(ValueError, match=what):
         run_demo(seed, frames=frames)
 

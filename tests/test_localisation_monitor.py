@@ -62,7 +62,7 @@ def test_claims_of_three_agents(why: str, false: dict[str, SE2], alarm: bool, fa
     assert report.faulty == faulty, why
 
 
-def test_two_agents_name_nobody() -> None:
+def test_two_agents_give_no_attribution() -> None:
     report = drive({"car2": SE2(8.0, 6.0)}, names=("car1", "car2"))
     assert report.alarm
     assert report.faulty == frozenset()

@@ -48,7 +48,7 @@ def test_there_are_files_to_look_through() -> None:
 
 
 @pytest.mark.parametrize("path", SHIPPED + RESULTS, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_what_is_handed_out_has_no_absolute_paths(path: Path) -> None:
+def test_shipped_files_have_no_absolute_paths(path: Path) -> None:
     content = path.read_bytes()
     if path.suffix == ".safetensors":  # its first 8 bytes are the length of the header that follows
         content = content[8 : 8 + int.from_bytes(content[:8], "little")]

@@ -120,7 +120,7 @@ def test_roll_and_pitch_are_dropped() -> None:
         (np.diag([1.0, 1.0, 2.0]), "last row of zeros and a one"),
     ],
 )
-def test_what_is_no_planar_rigid_transform_is_refused(matrix: Any, expected: str) -> None:
+def test_non_planar_transform_is_refused(matrix: Any, expected: str) -> None:
     with pytest.raises(ValueError, match=expected):
         SE2.from_matrix(matrix)
 

@@ -149,7 +149,7 @@ def test_feature_message_is_three_float16_maps() -> None:
 
 
 @pytest.mark.parametrize("name", FUSION_METHODS)
-def test_whoever_is_refused_takes_no_part(name: str) -> None:
+def test_refused_agents_are_not_fused(name: str) -> None:
     detector = small_detector()
     alone, refused = method(name, detector), method(name, detector)
     if isinstance(alone, IntermediateFusion) and isinstance(refused, IntermediateFusion):
@@ -252,7 +252,7 @@ def test_bad_input_names_the_agent(
         system.step(clouds, ego, poses=poses)
 
 
-def test_unknown_names_are_told_the_nearest() -> None:
+def test_unknown_name_error_names_nearest() -> None:
     with pytest.raises(ValueError, match=r"'cobevglu'; did you mean 'cobevglue'"):
         CoBEVGlue.pretrained("compact", fusion="cobevglu")
     with pytest.raises(ValueError, match=r"'bevgleu'; did you mean 'bevglue'"):
@@ -260,7 +260,7 @@ def test_unknown_names_are_told_the_nearest() -> None:
     assert set(ALIGNERS) >= {"bevglue", "given"}
 
 
-def test_own_vehicles_travel_with_the_boxes(compact: PointPillars) -> None:
+def test_own_vehicles_are_sent_with_boxes(compact: PointPillars) -> None:
     """The other agent's vehicle costs 32 bytes; the aligner is given both, and none where none is known."""
 
     class Listening(Pairwise):

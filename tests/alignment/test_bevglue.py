@@ -211,7 +211,7 @@ def test_swapped_roles_give_the_inverse_after_refits(seed: int) -> None:
     assert {(m, n) for n, m in pairs_of(there)} == pairs_of(here)
 
 
-def test_what_is_no_geometry_does_not_matter() -> None:
+def test_non_geometric_fields_have_no_effect() -> None:
     """Heights, scores, labels and single-frame track ids say nothing about the pose."""
     scene = pair_of_views(7, 3, 2, 2)
     n = len(scene.ego)
@@ -358,7 +358,7 @@ def test_the_covariance_is_honest_about_a_detectors_errors() -> None:
     assert np.mean(squared) < 6.0
 
 
-def test_more_common_objects_make_the_pose_surer() -> None:
+def test_more_common_objects_lower_the_risk() -> None:
     def spread(common: int) -> float:
         found = [align(p.ego, p.other) for p in (pair_of_views(common, seed) for seed in range(20))]
         return float(np.mean([np.trace(a.covariance) for a in found]))

@@ -82,7 +82,7 @@ def test_an_oblique_row_leaves_both_angles_open() -> None:
     [([(8, 2)], (True, False, False)), ([(8, 2), (30, -6)], (True, False, False))],
     ids=["one", "two"],
 )
-def test_below_three_pairs_there_is_only_z(places: object, observable: tuple[bool, bool, bool]) -> None:
+def test_below_three_pairs_only_z_is_observable(places: object, observable: tuple[bool, bool, bool]) -> None:
     assert estimate_levelling(*views(places, 1.0, 0.0, 0.0)).observable == observable
 
 
@@ -171,7 +171,7 @@ def test_covariance_is_consistent() -> None:
     assert low < np.mean(heights) < high
 
 
-def test_filter_gathers_what_frames_lack() -> None:
+def test_filter_accumulates_information_over_frames() -> None:
     """Two cars in a frame never make a plane; those of four frames do."""
     levelling = LevellingFilter(LevellingConfig(correlation=1.0))
     for first in range(0, 8, 2):

@@ -211,7 +211,7 @@ def test_an_error_above_the_gate_is_not_repaired() -> None:
     assert error(found["other"], pair.ego_SE2_other)[0] > 5.0
 
 
-def test_alone_there_is_nobody_to_place() -> None:
+def test_ego_alone_gives_no_poses() -> None:
     assert align(CoAlign(), {"car1": boxes_at(seen_from(CAR1), CAR1)}) == {}
 
 
@@ -269,7 +269,7 @@ def test_without_conflicts_landmarks_are_the_connected_components(seed: int) -> 
 # Bad input
 
 
-def test_it_asks_for_what_it_needs() -> None:
+def test_declared_needs_are_those_used() -> None:
     observation = Observation(boxes=FOUR, pose=pose_of(CAR1))
     with pytest.raises(ValueError, match="CoAlign needs variance of every agent"):
         CoAlign().select_inputs(observation)

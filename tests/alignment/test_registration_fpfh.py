@@ -54,7 +54,7 @@ def test_unrelated_clouds_are_refused() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 9])
 @pytest.mark.parametrize("who", ["ego", "other"])
-def test_next_to_no_points_are_refused(count: int, who: str) -> None:
+def test_too_few_points_are_refused(count: int, who: str) -> None:
     observations = pair()
     points = observations[who].points
     assert points is not None
@@ -69,7 +69,7 @@ def test_points_in_one_place_are_refused() -> None:
     assert not align(FPFHTeaser(), {"ego": Observation(points=cloud), "other": pair()["other"]})["other"].accepted
 
 
-def test_alone_there_is_nobody_to_place() -> None:
+def test_ego_alone_gives_no_poses() -> None:
     assert align(FPFHTeaser(), {"ego": pair()["ego"]}) == {}
 
 
@@ -79,7 +79,7 @@ def test_settings_are_checked(least: float) -> None:
         FPFHTeaser(min_inliers=least)  # type: ignore[arg-type]
 
 
-def test_without_open3d_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_open3d_error_names_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     fpfh._open3d.cache_clear()
     with pytest.raises(ModuleNotFoundError, match=r"pip install cobevglue\[registration\]"):

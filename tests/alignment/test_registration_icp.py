@@ -71,7 +71,7 @@ def test_each_collaborator_has_its_own_pose(name: str) -> None:
 @BOTH
 @pytest.mark.parametrize("count", [0, 1, 9])
 @pytest.mark.parametrize("who", ["ego", "other"])
-def test_next_to_no_points_leave_the_claimed_pose(name: str, count: int, who: str) -> None:
+def test_too_few_points_keep_the_claimed_pose(name: str, count: int, who: str) -> None:
     observations = pair(SE2(0.5, 0.0, 0.0))
     few = observations[who].points
     assert few is not None
@@ -96,7 +96,7 @@ def test_clouds_that_say_nothing_break_nothing(name: str, kind: str) -> None:
         assert error(found, TRUTH)[0] <= 15.0
 
 
-def test_what_diverges_is_refused() -> None:
+def test_diverging_registration_is_refused() -> None:
     """Two parallel walls without ends pin down no position along them; this step goes far along."""
 
     class Runaway(ICP2D):
@@ -143,7 +143,7 @@ def test_settings_are_checked(name: str, gates: tuple[float, ...]) -> None:
         group_aligner(name, gates=gates)
 
 
-def test_without_small_gicp_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_small_gicp_error_names_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install cobevglue\[registration\]"):
         align(ICP3D(), pair(SE2()))

@@ -82,7 +82,7 @@ def test_points_arrive_within_a_centimetre(name: str, budget: int | None) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_arrived_is_looked_at_as_it_is(name: str) -> None:
+def test_received_points_are_not_sampled_again(name: str) -> None:
     one = aligner(name)
     observation = seen_by(name)
     arrived = one.decode(one.encode("car1", observation, 0.0, 0), observation)
@@ -118,7 +118,7 @@ def test_the_sample_is_spread_evenly() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nobody_is_told_more_than_is_needed(name: str) -> None:
+def test_only_needed_fields_are_transmitted(name: str) -> None:
     everything = Observation(points=CLOUD, pose=np.eye(4), variance=np.ones((0, 3)))
     needed = aligner(name).select_inputs(everything)
     assert (needed.variance, needed.boxes, needed.features) == (None, None, None)

@@ -82,7 +82,7 @@ def test_unrelated_points_hardly_agree() -> None:
     assert len(robust_motion(target, source, 0.3).inliers) < 10
 
 
-def test_teaser_itself_says_the_same() -> None:
+def test_own_solver_agrees_with_teaser() -> None:
     library = pytest.importorskip("teaserpp_python", reason="TEASER++ is not on PyPI: its own build is needed")
     target, source, rotation, translation = pairs(8, 30, 60)
     motion = teaserpp_motion(library, target, source, 0.3)

@@ -165,7 +165,7 @@ def test_new_track_id_begins_at_rest() -> None:
         pytest.param(SE2(0.7, 0.5, 0.0), SE2(), True, True, id="sideways, but the agent tells its own vehicle"),
     ],
 )
-def test_frame_of_a_vehicle_is_told_from_others(step: SE2, start: SE2, known: bool, is_vehicle: bool) -> None:
+def test_vehicle_frames_are_recognised(step: SE2, start: SE2, known: bool, is_vehicle: bool) -> None:
     motion, pose = FrameMotion(), start
     for k in range(40):
         boxes = observed(0.1 * k, pose, 3)

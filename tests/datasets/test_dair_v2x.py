@@ -232,7 +232,7 @@ def test_missing_split_file_error_lists_places(root: Path) -> None:
         DAIRV2X(root, "train")
 
 
-def test_wrong_root_error_says_what_was_expected(tmp_path: Path) -> None:
+def test_wrong_root_error_names_expected_layout(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"looked for .*cooperative/data_info\.json"):
         DAIRV2X(tmp_path, "val")
 
@@ -255,7 +255,7 @@ def test_clouds_are_right_handed_and_may_be_missing(root: Path, encoding: Encodi
 
 
 @pytest.mark.parametrize("nothing", ["", None, {"delta_x": "", "delta_y": ""}])
-def test_a_pair_that_nobody_corrected_has_no_offset(root: Path, nothing: Any) -> None:
+def test_uncorrected_pair_has_no_offset(root: Path, nothing: Any) -> None:
     edit(root / "cooperative/data_info.json", lambda rows: rows[-1].update(system_error_offset=nothing))
     pose = DAIRV2X(root, "val")["34"][0].agents["infrastructure"].world_SE3_lidar
     np.testing.assert_allclose(pose, WORLD_UNIT_AS_CALIBRATED, atol=1e-9)
@@ -280,7 +280,7 @@ def test_frame_without_side_labels_has_no_objects(root: Path) -> None:
     assert len(frame.agents["vehicle"].objects) == len(frame.ground_truth("vehicle")) == 0
 
 
-def test_frames_travel_to_worker_processes(root: Path) -> None:
+def test_frames_can_be_pickled(root: Path) -> None:
     frame = pickle.loads(pickle.dumps(DAIRV2X(root, "val")["34"][0]))
     assert len(frame.ground_truth("vehicle")) == 2
 

@@ -62,7 +62,7 @@ def assert_same(read: Boxes, truth: Boxes) -> None:
 
 
 @pytest.mark.parametrize("labels", ["complemented", "original"])
-def test_what_is_written_is_read_back(labels: str, tmp_path: Path) -> None:
+def test_written_files_are_read_back(labels: str, tmp_path: Path) -> None:
     write(tmp_path, "000001", "000002")
     write_dair_v2x_index(tmp_path, "test", [DAIRPair("000001", "b", 0.0), DAIRPair("000002", "b", 0.1)])
     scenario = DAIRV2X(tmp_path, "test", labels=labels)["b"]  # type: ignore[arg-type]
@@ -96,7 +96,7 @@ def test_common_labels_of_a_leaning_car(tmp_path: Path) -> None:
     )
 
 
-def test_frames_are_added_to_what_is_there(tmp_path: Path) -> None:
+def test_frames_are_added_to_an_existing_tree(tmp_path: Path) -> None:
     write(tmp_path, "000001", "000002", "000003", with_points=False)
     write_dair_v2x_index(tmp_path, "train", [DAIRPair("000001", "a", 0.0)])
     write_dair_v2x_index(tmp_path, "test", [DAIRPair("000002", "b", 0.0)])
@@ -114,7 +114,7 @@ def test_only_the_files_of_a_frame_are_written(with_points: bool, tmp_path: Path
 
 
 @pytest.mark.parametrize(("frame", "car", "said"), [("x", CAR, "digits"), ("000001", 2 * CAR, "vehicle-side")])
-def test_what_the_format_cannot_hold(frame: str, car: FloatArray, said: str, tmp_path: Path) -> None:
+def test_unsupported_values_are_refused(frame: str, car: FloatArray, said: str, tmp_path: Path) -> None:
     side = DAIRSide(UNIT, Boxes.empty())
     with pytest.raises(ValueError, match=said):
         write_dair_v2x_frame(tmp_path, frame, DAIRSide(car, Boxes.empty()), side, Boxes.empty())

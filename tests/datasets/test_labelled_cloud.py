@@ -48,7 +48,7 @@ def test_no_points_and_no_boxes() -> None:
     assert count_points(nothing, Boxes.empty()).shape == (0,)
 
 
-def test_a_cloud_refuses_what_does_not_fit() -> None:
+def test_cloud_with_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match="points must have shape"):
         LabelledCloud(np.zeros((3, 3), dtype=np.float32), Boxes.empty(), np.zeros(0, dtype=np.int64))
     with pytest.raises(ValueError, match="point_count must have shape"):

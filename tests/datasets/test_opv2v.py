@@ -221,7 +221,7 @@ def test_a_file_that_vanishes_is_named(tmp_path: Path) -> None:
         _ = frame.agents["1"].objects
 
 
-def test_frames_travel_to_worker_processes(tmp_path: Path) -> None:
+def test_frames_can_be_pickled(tmp_path: Path) -> None:
     tree(tmp_path, "test/a/1/000000")
     frame = pickle.loads(pickle.dumps(OPV2V(tmp_path, "test")["a"][0]))
     assert len(frame.agents["1"].objects) == 0
@@ -252,7 +252,7 @@ def test_missing_scenario_error_names_nearest(tmp_path: Path) -> None:
         data["TwoCars1"]
 
 
-def test_wrong_root_error_says_what_was_expected(tmp_path: Path) -> None:
+def test_wrong_root_error_names_expected_layout(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         OPV2V(tmp_path / "nowhere", "test")
     (tmp_path / "test").mkdir()
@@ -278,7 +278,7 @@ POSE = st.tuples(*[COORDINATE] * 3, st.floats(-10, 10), st.floats(-180, 180), st
 
 @settings(max_examples=40, deadline=None)
 @given(OBJECTS, POSE)
-def test_what_is_written_is_read_again(
+def test_written_frames_are_read_again(
     tmp_path_factory: pytest.TempPathFactory, rows: list[Any], pose: tuple[float, ...]
 ) -> None:
     centers, sizes, yaws, numbers = zip(*rows, strict=True) if rows else ([], [], [], [])
@@ -322,9 +322,7 @@ def test_file_is_left_handed_and_in_degrees(tmp_path: Path) -> None:
         ({"points": np.zeros((1, 3))}, "points must have shape"),
     ],
 )
-def test_the_writer_refuses_what_the_format_cannot_hold(
-    tmp_path: Path, arguments: dict[str, Any], message: str
-) -> None:
+def test_writer_refuses_unsupported_values(tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
     objects = Boxes([[0, 0, 0]], [[4, 2, 1]], [0], track_id=[1])
     good: dict[str, Any] = {"timestamp": "000068", "world_SE3_lidar": np.eye(4), "objects": objects}
     with pytest.raises(ValueError, match=message):

@@ -98,7 +98,7 @@ def test_points_survive_writing_and_reading_exactly(
     ("points", "message"),
     [(np.zeros((2, 3)), "shape"), ([[0, 0, np.nan, 0]], "finite"), ([[0, 0, 0, 1.5]], r"\[0, 1\]")],
 )
-def test_writing_refuses_what_it_cannot_store(tmp_path: Path, points: object, message: str) -> None:
+def test_writer_refuses_unsupported_points(tmp_path: Path, points: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         write_pcd_rgb(tmp_path / "a.pcd", points)
 

@@ -94,7 +94,7 @@ def test_untilted_boxes_move_as_in_the_plane() -> None:
         ("pose", "numbers"),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused(matrix: object, message: str) -> None:
+def test_non_rigid_transform_is_refused(matrix: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rigid_SE3(matrix)
 

@@ -44,7 +44,7 @@ def written(root: Path, *, left_handed: bool = False) -> Path:
 
 
 @pytest.mark.parametrize("left_handed", [False, True])
-def test_what_is_written_is_read_back(left_handed: bool, tmp_path: Path) -> None:
+def test_written_files_are_read_back(left_handed: bool, tmp_path: Path) -> None:
     written(tmp_path, left_handed=left_handed)
     scenario = V2V4Real(tmp_path, "test", left_handed=left_handed)["drive"]
     assert [frame.time for frame in scenario] == pytest.approx([0.0, 0.1])
@@ -86,7 +86,7 @@ def test_labels_without_a_cloud(tmp_path: Path) -> None:
         ("0", "000000", np.eye(4), OBJECTS.replace(track_id=[-1, 2, 3]), "track_id"),  # -1: not associated
     ],
 )
-def test_what_the_format_cannot_hold(
+def test_unsupported_values_are_refused(
     agent: str, number: str, matrix: FloatArray, objects: Boxes, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=said):

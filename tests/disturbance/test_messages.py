@@ -47,7 +47,7 @@ def test_fabricated_boxes_are_sendable_and_sorted() -> None:
     assert received.track_id.tolist() == view.boxes.track_id.tolist()
 
 
-def test_who_sees_nothing_can_make_things_up_too() -> None:
+def test_empty_list_can_get_fabricated_boxes() -> None:
     blind = replace(
         FRAMES[0].observations["car2"], boxes=Boxes.empty(), variance=np.zeros((0, 3)), detections=Boxes.empty()
     )

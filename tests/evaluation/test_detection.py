@@ -178,7 +178,7 @@ def test_range_bins_use_the_matched_object() -> None:
     assert (report.overall.truth, report.overall.at[0.5].detections) == (2, 2)
 
 
-def test_recall_and_precision_are_those_of_sure_detections() -> None:
+def test_recall_and_precision_use_confident_detections() -> None:
     one = frame([A, B, C], (A, 0.9), (NOWHERE, 0.5), (B, 0.3), (C, 0.29))
     score = evaluate_detections([one], score_threshold=0.3).overall.at[0.5]
     assert (score.recall, score.precision, score.detections) == pytest.approx((2 / 3, 2 / 3, 4))
@@ -238,7 +238,7 @@ def test_a_report_becomes_json() -> None:
         (lambda: evaluate_detections([frame([A])], evaluation_range=(1.0, -1.0, 0.0, 1.0)), "evaluation_range"),
     ],
 )
-def test_what_cannot_be_evaluated_is_named(make: object, said: str) -> None:
+def test_invalid_input_error_names_the_field(make: object, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         make()  # type: ignore[operator]
 

@@ -80,13 +80,13 @@ def test_times_are_medians_per_cloud() -> None:
     assert made.perception_milliseconds() == pytest.approx({"head": 20.0})
 
 
-def test_what_was_left_out_is_added_up() -> None:
+def test_omitted_frames_are_summed() -> None:
     one = results((cars(0), cars(score=0.5), ()), without=2).sequences[0]
     assert Results([one, one], RANGE, 5).left_out == {"without": 4}
     assert Results([one, one], RANGE, 5).frame_count == 2
 
 
-def test_success_refusals_and_wrong_poses_are_told_apart() -> None:
+def test_success_refusals_and_wrong_poses_are_counted() -> None:
     quality = pose_quality(
         [
             received("good", 0.5, 0.5),

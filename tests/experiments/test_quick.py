@@ -38,7 +38,7 @@ def test_every_table_is_there(tables: dict[str, Rows]) -> None:
 
 
 @pytest.mark.parametrize("title", ["CoBEVGlue", "No collaboration", "True pose, CoBEVGlue's fusion"])
-def test_noise_is_nothing_to_whom_poses_are_nothing(tables: dict[str, Rows], title: str) -> None:
+def test_noise_has_no_effect_without_claimed_poses(tables: dict[str, Rows], title: str) -> None:
     row = tables["noise_ap0.5"][title]
     assert row["0.0/0.0"] == row["2.5/2.5"]
 

@@ -61,7 +61,7 @@ def same(a: Boxes, b: Boxes) -> bool:
     return all((one is None and other is None) or np.array_equal(one, other) for one, other in pairs)  # type: ignore[arg-type]
 
 
-def test_what_is_written_reads_back(tmp_path: Path) -> None:
+def test_written_results_read_back(tmp_path: Path) -> None:
     before = result()
     write_result(tmp_path / "folder" / "one.npz", before)
     after = read_result(tmp_path / "folder" / "one.npz")

@@ -56,7 +56,7 @@ def test_true_poses_make_noise_harmless(settings: StudySettings) -> None:
 
 
 @pytest.mark.parametrize("attack", [STRONG, {"disturbance": "same-place"}, {"disturbance": "offset"}])
-def test_what_agents_claim_does_not_reach_bevglue(settings: StudySettings, attack: dict[str, object]) -> None:
+def test_claimed_poses_do_not_reach_bevglue(settings: StudySettings, attack: dict[str, object]) -> None:
     attacked = OURS.model_copy(update=attack)
     result = run(settings, [OURS, attacked])
     assert numbers(result.conditions[attacked.key]) == numbers(result.conditions[OURS.key])

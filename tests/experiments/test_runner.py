@@ -51,7 +51,7 @@ def test_every_drive_is_run_under_every_condition_once(whole: list[ScenarioResul
         assert all(list(run.frames) == [0, 1, 2] for run in sequence.conditions.values())
 
 
-def test_an_interrupted_run_goes_on(settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path) -> None:
+def test_interrupted_run_is_resumed(settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path) -> None:
     def interrupt(done: float, total: float) -> None:
         if done > total / 2:
             raise KeyboardInterrupt
@@ -99,7 +99,7 @@ def test_results_of_another_study_are_not_mixed_in(
         run_study(one.model_copy(update=change), CONDITIONS[:1], tmp_path)
 
 
-def test_only_what_has_other_weights_is_run_anew(tmp_path: Path) -> None:
+def test_only_changed_weights_are_run_again(tmp_path: Path) -> None:
     tiny_tree(tmp_path / "data", frames=2)
     file = tiny_detector(tmp_path)
     detector = PointPillars.load(file)
@@ -142,7 +142,9 @@ def test_damaged_files_are_named(settings: StudySettings, tmp_path: Path) -> Non
         run_study(settings, CONDITIONS[:1], tmp_path)
 
 
-def test_processes_give_the_same(settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path) -> None:
+def test_results_do_not_depend_on_processes(
+    settings: StudySettings, whole: list[ScenarioResult], tmp_path: Path
+) -> None:
     progress: list[tuple[float, float]] = []
     results = run_study(settings, CONDITIONS, tmp_path, workers=2, progress=lambda *now: progress.append(now))
     assert numbers(results) == numbers(whole)
@@ -150,7 +152,7 @@ def test_processes_give_the_same(settings: StudySettings, whole: list[ScenarioRe
     assert [done for done, _ in progress] == sorted(done for done, _ in progress)
 
 
-def test_what_goes_wrong_in_a_process_is_said(tiny: Path, tmp_path: Path) -> None:
+def test_worker_errors_are_reported(tiny: Path, tmp_path: Path) -> None:
     tiny_tree(tmp_path / "data", frames=2)
     (tmp_path / "data" / "test" / "b_three" / "2" / "000002.yaml").write_text("nothing: 1")
     settings = tiny_settings(tiny, root=str(tmp_path / "data"))

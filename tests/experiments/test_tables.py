@@ -42,7 +42,7 @@ def column(table: Table, name: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("experiment", ALL, ids=lambda experiment: experiment.name)
-def test_a_table_needs_only_what_it_asked_for(results: Results, experiment: object) -> None:
+def test_table_uses_only_its_conditions(results: Results, experiment: object) -> None:
     from dataclasses import replace
 
     from cobevglue.experiments.tables import Experiment
@@ -133,7 +133,7 @@ def test_poses_are_counted_by_collaborator(results: Results) -> None:
     assert exact[3:8] == [0.0, 1.0, 1.0, 1.0, 0.0]
 
 
-def test_communication_is_what_was_sent(results: Results) -> None:
+def test_communication_equals_encoded_bytes(results: Results) -> None:
     made = table(results, "communication", "communication")
     sent = column(made, "bytes")
     assert sent["CoBEVGlue"] == results.payload_bytes(as_is("cobevglue"))
@@ -155,7 +155,7 @@ def test_bandwidth_compresses_every_method_with_features(results: Results) -> No
     assert compressed["CoBEVGlue"][4] == sent < 0.3 * results.payload_bytes(as_is("cobevglue"))
 
 
-def test_the_summary_leaves_out_what_was_not_run(results: Results) -> None:
+def test_summary_omits_tables_not_run(results: Results) -> None:
     made = summary(QUICK, {"here": results, "there": results})
     assert list(made.columns) == ["", "here", "there"]
     assert column(made, "here") == column(made, "there")

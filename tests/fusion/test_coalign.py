@@ -13,7 +13,7 @@ from cobevglue.fusion.coalign import CoAlign, ego_attention
 from . import checks
 
 
-def test_attention_is_what_the_formula_says() -> None:
+def test_attention_equals_the_formula() -> None:
     x = np.random.default_rng(0).normal(size=(3, 5, 2, 4))
     expected = np.zeros((5, 2, 4))
     for row in range(2):

@@ -49,7 +49,7 @@ def test_stride_4_cells_are_where_warping_expects() -> None:
 
 
 @every_method
-def test_messages_say_what_training_sees(kind: type[CoarseMapFusion]) -> None:
+def test_message_equals_training_input(kind: type[CoarseMapFusion]) -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = checks.seeded(kind, DETECTOR)
     method.up.weight.data.mul_(500.0)

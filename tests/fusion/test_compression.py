@@ -78,7 +78,7 @@ def test_other_types_than_float16_arrive_as_sent() -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 1.0))
-def test_exactly_the_most_confident_cells_travel(seed: int, share: float) -> None:
+def test_only_most_confident_cells_are_transmitted(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     confidence = torch.from_numpy(rng.random((1, 1, ROWS, COLUMNS)).astype(np.float32))
     cells = most_confident(confidence, share)
@@ -140,7 +140,7 @@ def test_unsent_cells_count_as_out_of_reach(name: str) -> None:
         ("fpv-rcnn", {"cells": 0.5}, "cells: FPVRCNN sends no whole maps"),
     ],
 )
-def test_what_cannot_be_compressed_is_refused(name: str, options: dict[str, float], message: str) -> None:
+def test_invalid_compression_is_refused(name: str, options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CompressedFusion(FUSION_METHODS[name](DETECTOR), Compression.model_validate(options))
 

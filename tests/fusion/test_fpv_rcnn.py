@@ -316,7 +316,7 @@ def test_proposals_and_keypoints_move_with_their_agent() -> None:
     checks.assert_same_boxes(method.fuse(ego, [away]), here, atol=0.02)
 
 
-def test_what_nobody_else_reaches_stays_as_it_is() -> None:
+def test_uncovered_cells_stay_unchanged() -> None:
     """Of an agent far away everything is far away; what the ego found is not touched."""
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = method_with_weights()

@@ -36,7 +36,7 @@ def cars(*rows: tuple[float, float, float], score: float | None = None) -> Boxes
         ([cars()], False),
     ],
 )
-def test_who_is_believed(told: list[Boxes], turned: bool) -> None:
+def test_majority_decides_the_heading(told: list[Boxes], turned: bool) -> None:
     boxes = cars((0, 0, 0), score=0.7)
     faced = vote_headings(boxes, told)
     assert bool(np.cos(faced.yaw[0]) < 0) == turned

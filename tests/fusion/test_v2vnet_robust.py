@@ -118,7 +118,7 @@ _METRES, _TURN = st.floats(-50.0, 50.0), st.floats(-3.0, 3.0)
 
 
 @given(st.tuples(_METRES, _METRES, _TURN), st.tuples(_METRES, _METRES, _TURN))
-def test_the_true_correction_leads_to_the_true_pose(believed: tuple[float, ...], true: tuple[float, ...]) -> None:
+def test_true_correction_gives_the_true_pose(believed: tuple[float, ...], true: tuple[float, ...]) -> None:
     pose, wanted = SE2(*believed), SE2(*true)
     found = apply_correction(pose, true_correction(pose, wanted).tolist())
     assert found.error_to(wanted) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -225,7 +225,7 @@ def test_correct_poses_stay_as_claimed() -> None:
         assert kept.error_to(claimed) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-def test_an_ego_alone_has_nobody_to_find() -> None:
+def test_ego_alone_has_no_matches() -> None:
     observation = Observation(features=checks.view(DETECTOR, 0).features, pose=np.eye(4))
     assert V2VNetRobustPoses(make_method()).align_group("ego", {"ego": observation}) == {}
 

@@ -68,7 +68,7 @@ def test_peak_is_warped_to_its_new_place(config: PointPillarsConfig, stride: int
     x=st.floats(-30, 30), y=st.floats(-15, 15), yaw=st.floats(-math.pi, math.pi),
     place=st.tuples(st.floats(-55, 55), st.floats(-28, 28)),
 )  # fmt: skip
-def test_every_cell_has_what_lies_at_its_centre(x: float, y: float, yaw: float, place: tuple[float, float]) -> None:
+def test_cells_have_the_value_at_their_centre(x: float, y: float, yaw: float, place: tuple[float, float]) -> None:
     pose = SE2(x, y, yaw)
     # A plane is what bilinear interpolation reproduces without error.
     xs, ys = cell_centres(COMPACT, 4)

@@ -55,7 +55,7 @@ def test_threshold_0_sends_everything_and_1_nothing() -> None:
     assert len(method_with(1.0).message(seen)["cells"]) == 0
 
 
-def test_what_arrives_is_the_masked_map() -> None:
+def test_received_map_is_the_masked_map() -> None:
     seen = checks.view(DETECTOR, 0)
     method = method_with(threshold_for(seen, 150))
     with torch.inference_mode():
@@ -123,7 +123,7 @@ def test_agent_sending_nothing_nearby_changes_nothing(threshold: float) -> None:
     checks.assert_same_boxes(method.fuse(ego, [checks.sent(method, other, pose)]), method.fuse(ego, []), atol=1e-6)
 
 
-def test_messages_say_what_training_sees() -> None:
+def test_message_equals_training_input() -> None:
     ego, other = checks.view(DETECTOR, 0), checks.view(DETECTOR, 1)
     method = method_with(threshold_for(other, 150))
     with torch.inference_mode():
@@ -135,7 +135,7 @@ def test_messages_say_what_training_sees() -> None:
     torch.testing.assert_close(over_the_wire, seen[0], atol=2e-3, rtol=1e-3)
 
 
-def test_attention_is_what_the_formula_says() -> None:
+def test_attention_equals_the_formula() -> None:
     rng = np.random.default_rng(0)
     features, confidence = rng.normal(size=(3, 5, 1, 2)), rng.uniform(0.1, 0.9, (3, 1, 1, 2))
     distance = rng.uniform(0, 50, (3, 1, 1, 2))

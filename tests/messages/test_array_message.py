@@ -20,7 +20,7 @@ ARRAYS = st.dictionaries(
 
 
 @given(ARRAYS)
-def test_what_is_sent_arrives(arrays: dict[str, np.ndarray]) -> None:
+def test_arrays_round_trip(arrays: dict[str, np.ndarray]) -> None:
     received = decode_arrays(encode_arrays(arrays))
     assert list(received) == list(arrays)
     for name, array in arrays.items():
@@ -50,7 +50,7 @@ def test_size_is_data_plus_small_header() -> None:
     assert len(message) == 48 * 100 * 176 * 2 + (6 + 1 + 4 + 2 + 3 * 4 + 4)
 
 
-def test_big_endian_numbers_travel_as_little_endian_ones() -> None:
+def test_big_endian_arrays_are_sent_little_endian() -> None:
     received = decode_arrays(encode_arrays({"a": np.array([1.5, 2.5], dtype=">f4")}))
     np.testing.assert_array_equal(received["a"], [1.5, 2.5])
 
@@ -65,7 +65,7 @@ def test_big_endian_numbers_travel_as_little_endian_ones() -> None:
         ({str(i): np.zeros(1) for i in range(256)}, "256 arrays"),
     ],
 )
-def test_what_does_not_travel_is_named(arrays: dict[str, np.ndarray], what: str) -> None:
+def test_unsupported_arrays_are_named(arrays: dict[str, np.ndarray], what: str) -> None:
     with pytest.raises(MessageError, match=what):
         encode_arrays(arrays)
 

@@ -103,7 +103,7 @@ def test_round_trip_is_exact_to_the_units(sent: CollectivePerception) -> None:
 
 @given(messages())
 @settings(max_examples=100, deadline=None)
-def test_what_was_decoded_encodes_to_same_bytes(sent: CollectivePerception) -> None:
+def test_decoded_message_encodes_to_same_bytes(sent: CollectivePerception) -> None:
     data = encode(dataclasses.replace(sent, sensor_type=None))
     assert encode(decode(data)) == data
 
@@ -375,7 +375,7 @@ def test_polar_velocity_of_others_is_read() -> None:
     np.testing.assert_allclose(got, [(0.0, 5.0)], atol=1e-9)
 
 
-def test_containers_we_do_not_know_are_skipped() -> None:
+def test_unknown_containers_are_skipped() -> None:
     whole = CPM.decode("CollectivePerceptionMessage", encode(message()))
     whole["payload"]["cpmContainers"].append({"containerId": 4, "containerData": b"\x01\x02\x03"})
     assert len(decode(CPM.encode("CollectivePerceptionMessage", whole)).boxes) == 2
@@ -430,7 +430,7 @@ def test_field_outside_its_limits_is_named(make: Callable[[], Any], expected: st
         ({"is_infrastructure": True}, "heading: required for a roadside unit"),
     ],
 )
-def test_what_would_arrive_wrong_is_not_encoded(changes: dict[str, Any], expected: str) -> None:
+def test_values_beyond_limits_are_not_encoded(changes: dict[str, Any], expected: str) -> None:
     with pytest.raises(MessageError, match=expected):
         encode(message(**changes))
 
@@ -490,7 +490,7 @@ def test_two_objects_with_one_id_are_refused() -> None:
 
 
 @pytest.mark.parametrize("data", ["text", None, 5])
-def test_what_is_not_bytes_is_a_message_error(data: Any) -> None:
+def test_non_bytes_raise_a_message_error(data: Any) -> None:
     with pytest.raises(MessageError, match="a message is bytes"):
         decode(data)
 

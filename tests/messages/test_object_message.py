@@ -91,7 +91,7 @@ def test_bytes_of_version_1_stay_readable() -> None:
     assert old.boxes.track_id.tolist() == [10]
 
 
-def test_world_positions_travel_relative_to_their_origin() -> None:
+def test_world_positions_are_sent_relative_to_origin() -> None:
     sent = boxes(3, center=[[691_000.123, 5_334_000.75, 512.4], [691_050.0, 5_334_100.001, 0], [690_990, 5_333_900, 0]])
     data = encode(message(boxes=sent))
     origin = struct.unpack_from("<2d", data, 20)
@@ -114,7 +114,7 @@ def test_positions_in_any_frame_survive_within_a_millimetre(
 
 
 @given(messages())
-def test_what_float32_holds_comes_back_exactly(sent: ObjectMessage) -> None:
+def test_float32_values_round_trip_exactly(sent: ObjectMessage) -> None:
     data = encode(sent)
     got = decode(data)
     assert (got.agent_id, got.time, got.frame) == (sent.agent_id, sent.time, sent.frame)
@@ -339,7 +339,7 @@ def test_wrong_header_is_refused_despite_checksum(offset: int, patch: bytes, exp
 
 
 @pytest.mark.parametrize("data", ["CBVG", None, 5, [1, 2]])
-def test_what_is_not_bytes_is_a_message_error(data: Any) -> None:
+def test_non_bytes_raise_a_message_error(data: Any) -> None:
     with pytest.raises(MessageError, match="a message is bytes"):
         decode(data)
 

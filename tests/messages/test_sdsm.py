@@ -102,7 +102,7 @@ def test_round_trip_is_exact_to_the_units(sent: SensorDataSharing, speeds: list[
 
 @given(messages())
 @settings(max_examples=100, deadline=None)
-def test_what_was_decoded_encodes_to_same_bytes(sent: SensorDataSharing) -> None:
+def test_decoded_message_encodes_to_same_bytes(sent: SensorDataSharing) -> None:
     data = encode(sent)
     assert encode(decode(data)) == data
 
@@ -291,7 +291,7 @@ def test_object_message_and_back() -> None:
         ({"body": BODY.replace(center=[(9, 0, 0)])}, "body must be located at the origin"),
     ],
 )
-def test_what_would_arrive_wrong_is_refused(changes: dict[str, Any], expected: str) -> None:
+def test_values_beyond_limits_are_refused(changes: dict[str, Any], expected: str) -> None:
     with pytest.raises(MessageError, match=expected):
         encode(message(**changes))
 

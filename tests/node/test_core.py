@@ -360,7 +360,7 @@ def test_impossible_agent_ids_are_refused(agent: str) -> None:
     st.lists(st.tuples(st.integers(0, 39), st.integers(0, 3), st.integers(0, 2000)), min_size=1, max_size=40),
     st.lists(st.binary(max_size=60), max_size=10),
 )
-def test_whatever_arrives_the_node_goes_on(deliveries: list[tuple[int, int, int]], noise: list[bytes]) -> None:
+def test_node_survives_arbitrary_deliveries(deliveries: list[tuple[int, int, int]], noise: list[bytes]) -> None:
     """Recorded messages in any order, some damaged, between others that mean nothing."""
     core = NodeCore("car1", 7)
     for step, (index, kind, at) in enumerate(deliveries):

@@ -53,7 +53,7 @@ def test_sums_over_labels() -> None:
     assert metrics.value("alignments_total") == 1
 
 
-def test_unknown_name_is_a_mistake() -> None:
+def test_unknown_metric_name_is_an_error() -> None:
     with pytest.raises(KeyError):
         Metrics().count("refuseds_total")
 

@@ -45,7 +45,7 @@ def nearest_iou(boxes: FloatArray) -> FloatArray:
     return iou
 
 
-def test_anchors_are_where_the_grid_says() -> None:
+def test_anchors_are_at_cell_centres() -> None:
     assert (GRID.rows, GRID.columns, GRID.types, GRID.cell) == (24, 32, 4, 0.8)
     assert len(GRID) == 24 * 32 * 4
     first, last = GRID.boxes([0, len(GRID) - 1])
@@ -75,7 +75,7 @@ def test_anchor_encoding_round_trips(boxes: list[tuple[float, ...]], data: st.Da
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(BOXES, min_size=1, max_size=6))
-def test_assignment_is_what_all_pairs_give(boxes: list[tuple[float, ...]]) -> None:
+def test_assignment_equals_that_over_all_pairs(boxes: list[tuple[float, ...]]) -> None:
     array = np.array(boxes)
     iou = nearest_iou(array)
     targets = assign_targets(array, np.zeros(len(array), dtype=bool), GRID)

@@ -40,7 +40,7 @@ def decoded(output: HeadOutput, **settings: float) -> tuple[Boxes, FloatArray]:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 1.5, 2.5, 3.1, -0.5, -1.5, -2.5, -3.1])
-def test_a_box_comes_out_as_it_was_told(yaw: float) -> None:
+def test_encoded_box_is_decoded_unchanged(yaw: float) -> None:
     boxes, variance = decoded(said((CELL, [*CAR[:6], yaw], 0.8, 0.3)))
     assert boxes.center.tolist() == [pytest.approx(CAR[:3], abs=1e-5)]
     assert boxes.size.tolist() == [pytest.approx(CAR[3:6], abs=1e-5)]
@@ -73,7 +73,7 @@ FAR_CELL = CELL + 4 * 10
         ({"nms_iou": 1.0}, [0.9, 0.8, 0.6]),
     ],
 )
-def test_the_best_stay_and_what_overlaps_them_goes(settings: dict[str, float], scores: list[float]) -> None:
+def test_nms_keeps_best_of_overlapping_boxes(settings: dict[str, float], scores: list[float]) -> None:
     near = [0.6, *CAR[1:]]
     output = said((CELL, CAR, 0.9, 0.2), (CELL + 4, near, 0.8, 0.2), (FAR_CELL, FAR, 0.6, 0.2))
     boxes, _ = decoded(output, **settings)
@@ -81,7 +81,7 @@ def test_the_best_stay_and_what_overlaps_them_goes(settings: dict[str, float], s
     assert boxes.score.tolist() == pytest.approx(scores, abs=1e-5)
 
 
-def test_with_a_penalty_the_surer_box_stays() -> None:
+def test_penalty_keeps_the_more_precise_box() -> None:
     near = [0.6, *CAR[1:]]
     output = said((CELL, CAR, 0.9, 1.0), (CELL + 4, near, 0.8, 0.1))
     assert decoded(output)[0].center[0, 0] == pytest.approx(0.4, abs=1e-5)
@@ -92,7 +92,7 @@ def test_with_a_penalty_the_surer_box_stays() -> None:
     assert variance[0, 0] == pytest.approx(0.01, rel=1e-4)
 
 
-def test_voting_moves_a_box_towards_the_surer_one() -> None:
+def test_voting_moves_box_towards_more_precise_one() -> None:
     near = [0.6, *CAR[1:6], 0.1]
     output = said((CELL, CAR, 0.9, 0.5), (CELL + 4, near, 0.8, 0.05), (FAR_CELL, FAR, 0.6, 0.2))
     boxes, _ = decoded(output, variance_voting=True)
@@ -109,7 +109,7 @@ def test_a_flipped_voter_turns_nothing_round() -> None:
     assert -0.05 < boxes.yaw[0] < 0.0
 
 
-def test_a_sure_voter_turns_an_unsure_box_round() -> None:
+def test_confident_vote_flips_an_uncertain_heading() -> None:
     flipped = [*CAR[:6], math.pi]
     output = said((CELL, CAR, 0.9, 0.2), (CELL + 4, flipped, 0.8, 0.2))
     output.direction[0, CELL] *= 0.01

@@ -224,7 +224,7 @@ def test_it_learns_that_bonnets_are_low() -> None:
         assert ((net(looks) > 0) == right).float().mean() > 0.95
 
 
-def test_a_detector_looks_twice_unless_told_not_to(trained: PointPillars) -> None:
+def test_heading_refinement_can_be_switched_off(trained: PointPillars) -> None:
     """Alone and in `Perception`; the settings switch it off."""
     cloud = cloud_of(OBJECTS)
     first = trained.detection

@@ -25,7 +25,7 @@ def test_objects_keep_their_identity_over_frames(trained: PointPillars) -> None:
     assert len(set(ids[0])) == 4
 
 
-def test_what_comes_out_belongs_together(trained: PointPillars) -> None:
+def test_outputs_have_consistent_lengths(trained: PointPillars) -> None:
     out = Perception(trained).step(cloud_of(OBJECTS))
     assert [tuple(f.shape) for f in out.features] == [(12, 24, 32), (16, 12, 16), (24, 6, 8)]
     assert out.variance.shape == (len(out.boxes), 3)
@@ -77,7 +77,7 @@ def test_after_a_reset_time_and_tracks_start_again(trained: PointPillars) -> Non
         ([1.0, 1.0, np.inf, 0.0], "no z"),
     ],
 )
-def test_points_that_are_no_measurements_are_counted(trained: PointPillars, point: list[float], why: str) -> None:
+def test_invalid_points_are_counted(trained: PointPillars, point: list[float], why: str) -> None:
     cloud = cloud_of(OBJECTS)
     expected = Perception(trained).step(cloud)
     out = Perception(trained).step(np.concatenate([cloud, np.tile(np.array(point, np.float32), (500, 1))]))
@@ -86,7 +86,7 @@ def test_points_that_are_no_measurements_are_counted(trained: PointPillars, poin
     np.testing.assert_array_equal(out.detections.bev, expected.detections.bev, why)
 
 
-def test_a_cloud_without_intensity_is_seen_whole(trained: PointPillars) -> None:
+def test_cloud_without_intensity_keeps_all_points(trained: PointPillars) -> None:
     cloud = cloud_of(OBJECTS)
     expected = Perception(trained).step(cloud)
     cloud[:, 3] = np.nan

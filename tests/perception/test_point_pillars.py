@@ -23,7 +23,7 @@ from .conftest import OBJECTS, SMALL, cloud_of
 CLOUD = cloud_of(OBJECTS)
 
 
-def test_it_finds_what_it_was_shown(trained: PointPillars) -> None:
+def test_trained_detector_finds_training_objects(trained: PointPillars) -> None:
     boxes = trained.detect(CLOUD)
     assert boxes.score is not None
     assert set(boxes.label if boxes.label is not None else ()) == {"vehicle"}
@@ -37,7 +37,7 @@ def test_it_finds_what_it_was_shown(trained: PointPillars) -> None:
     assert np.abs(wrap_angle(found.yaw - OBJECTS[:, 6])).max() < 0.2, "headings, not only axes"
 
 
-def test_it_knows_that_it_is_nearly_right(trained: PointPillars) -> None:
+def test_predicted_variances_are_small_after_training(trained: PointPillars) -> None:
     boxes, variance = trained.detect_with_uncertainty(CLOUD)
     assert variance.shape == (len(boxes), 3)
     assert boxes.score is not None
@@ -88,7 +88,7 @@ def test_a_batch_is_its_clouds_one_by_one(trained: PointPillars) -> None:
     assert trained.detect_batch([]) == []
 
 
-def test_points_moved_by_whole_cells_move_everything(trained: PointPillars) -> None:
+def test_shift_by_whole_cells_shifts_detections(trained: PointPillars) -> None:
     """By 8 pillars, one cell of the coarsest map. Where a point is, x and y, is left out of its description here."""
     wide = SMALL.model_copy(update={"x_range": (-25.6, 25.6), "y_range": (-25.6, 25.6)})
     detector = PointPillars(wide).eval()
@@ -253,7 +253,7 @@ def test_pretrained_names_the_nearest(monkeypatch: pytest.MonkeyPatch, tmp_path:
         PointPillars.pretrained("smal")
 
 
-def test_onnx_says_the_same(trained: PointPillars, tmp_path: Path) -> None:
+def test_onnx_output_equals_torch(trained: PointPillars, tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     path = tmp_path / "d.onnx"

@@ -214,7 +214,7 @@ def spoilt(data: bytes) -> bytes:
         ("drive.txt", lambda _: b"hello", r"drive.txt: a recording ends with .mcap, .db3, .bag"),
     ],
 )
-def test_what_is_no_recording_is_named(tmp_path: Path, name: str, content: Any, message: str) -> None:
+def test_file_that_is_no_recording_is_named(tmp_path: Path, name: str, content: Any, message: str) -> None:
     with new_detection_bag(tmp_path / "good") as bag:
         for number in range(50):
             bag.write("/a/objects", 1.0 + number, 1.0 + number, "lidar", BOXES)

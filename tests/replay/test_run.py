@@ -109,7 +109,7 @@ def test_lines_have_the_alignments_and_objects(results: tuple[Path, Summary, lis
             assert line["alignments"][name]["accepted"] == alignment.accepted
 
 
-def test_page_tells_agents_and_causes(results: tuple[Path, Summary, list[ReplayFrame]]) -> None:
+def test_page_lists_agents_and_refusal_reasons(results: tuple[Path, Summary, list[ReplayFrame]]) -> None:
     out, summary, _ = results
     page = (out / "index.html").read_text(encoding="utf-8")
     for words in ("Replay of drive", "car2", "car3", "/car1/objects", "10.0 Hz"):

@@ -109,6 +109,6 @@ def test_bad_topics_are_named(tmp_path: Path, ego: str | None, others: tuple[str
     ],
     ids=["no objects", "one topic", "nothing in common"],
 )
-def test_what_cannot_be_guessed_is_listed(tmp_path: Path, topics: dict[str, str], message: str) -> None:
+def test_ambiguous_topics_are_listed(tmp_path: Path, topics: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         chosen(tmp_path, topics)

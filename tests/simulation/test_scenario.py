@@ -169,7 +169,7 @@ def test_scenarios_cycle_networks_of_their_split() -> None:
         (lambda: ScenarioSettings(agent=3), "did you mean 'agents'"),  # type: ignore[call-arg]
     ],
 )
-def test_what_is_wrong_is_named(wrong, said: str) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_settings_are_named(wrong, said: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=said):
         wrong()
 

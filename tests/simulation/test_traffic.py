@@ -160,7 +160,7 @@ def test_unknown_network_error_names_nearest() -> None:
         Traffic("highway_tset_1")
 
 
-def test_without_sumo_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_sumo_error_names_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "libsumo", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install cobevglue\[simulation\]"):
         Traffic("junction_train_0")

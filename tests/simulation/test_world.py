@@ -74,13 +74,13 @@ def test_parked_vehicles_are_beside_road_without_overlap(kind: str) -> None:
         assert overlap.max() < 0.05
 
 
-def test_in_half_of_the_towns_nobody_parks() -> None:
+def test_half_of_towns_have_no_parked_cars() -> None:
     roads = RoadNetwork.load("town_test_0")
     empty = sum(not build_scenery(roads, np.random.default_rng(seed)).parked for seed in range(12))
     assert 2 <= empty <= 10
 
 
-def test_on_highways_nobody_parks() -> None:
+def test_highways_have_no_parked_cars() -> None:
     roads = RoadNetwork.load("highway_test_0")
     assert not any(build_scenery(roads, np.random.default_rng(seed)).parked for seed in range(4))
 

@@ -78,7 +78,7 @@ def test_eight_agents_find_room(duration: float) -> None:
         assert not any(a.intersects(b) for a, b in itertools.combinations(footprints, 2))
 
 
-def test_there_is_some_of_everything() -> None:
+def test_every_class_occurs() -> None:
     labels: set[str] = set()
     for seed in range(5):
         traffic = place_traffic(32, 2, 8.0, np.random.default_rng([seed, 0, 0]))
