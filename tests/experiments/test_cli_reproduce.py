@@ -30,7 +30,7 @@ def test_one_command_writes_a_report_that_says_which(
     assert reproduce(tiny, out, "--tables", "communication, time", "--frames", "2", "--seed", "7") == 0
     printed = capsys.readouterr()
     assert "AP@0.5, no collaboration" not in printed.out  # was not asked for
-    assert "objects that count" in printed.out
+    assert "evaluated objects" in printed.out
     assert str(out / "index.html") in printed.out
     report = (out / "report.md").read_text()
     assert "Command: cobevglue reproduce --quick --dataset opv2v --root" in report

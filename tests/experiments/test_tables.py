@@ -171,7 +171,7 @@ def test_summary_omits_tables_not_run(results: Results) -> None:
     )
     assert [row[0] for row in summary(QUICK, {"here": only}).rows] == [
         "frames",
-        "objects that count",
+        "evaluated objects",
         "AP@0.5, no collaboration",
         "AP@0.7, no collaboration",
     ]

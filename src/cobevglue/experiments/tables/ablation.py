@@ -51,8 +51,8 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     for iou in IOUS:
         alone += [results.ap(as_is("none"), iou)] + ([None] if published else [])
     notes: tuple[str, ...] = (
-        "As printed: `BEVGlueConfig.paper()`, which accepts whatever it finds; ours: the default, which refuses what "
-        "is doubtful. Without geometry every pair of boxes of similar size counts as common.",
+        "As printed: `BEVGlueConfig.paper()`, which accepts every match; ours: the default, which refuses uncertain "
+        "poses. Without geometry every pair of boxes of similar size is matched.",
         "The paper's first row is as good as no collaboration: its failed matches must have been dropped.",
     )
     notes += PAPERS if published else ()

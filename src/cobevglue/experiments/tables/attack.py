@@ -43,8 +43,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     notes: tuple[str, ...] = (
         "Without: poses from the source of the method's paper; for CoBEVGlue's fusion the claimed ones. With: "
         "poses from BEVGlue, which receives no claimed pose.",
-        "Added bytes: what BEVGlue sends, as a share of what the method sends for fusion, both as encoded. Features "
-        "are transmitted in 16 bits.",
+        "Added bytes: encoded bytes for BEVGlue, as a share of those for fusion. Features are transmitted in 16 bits.",
     )
     notes += PAPERS if published else ()
     return [Table("attack", "Same-place attack, without and with BEVGlue", columns, rows, notes)]

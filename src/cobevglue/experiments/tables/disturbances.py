@@ -62,15 +62,15 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
         rows.append(["no collaboration", results.ap(as_is("none"), iou, every), *[None] * (len(_rows(scope)) - 1)])
         title = f"AP@{iou:g} under further disturbances"
         notes = (f"On one frame in {every}; CoBEVGlue, which filters over time, is run on all frames.",)
-        tables.append(Table(f"disturbances_ap{iou:g}", title, ("what goes wrong", *_rows(scope)), rows, notes))
+        tables.append(Table(f"disturbances_ap{iou:g}", title, ("disturbance", *_rows(scope)), rows, notes))
     ours = scope.ours
     rows = []
     for title, what in _FURTHER.items():
         condition = _condition(scope, {"fusion": ours}, what)
         quality = pose_quality([pose for _, pose in results.received_poses(condition)])
         rows.append([title, quality.count, quality.refused, quality.wrong, quality.success_1, quality.success_3])
-    columns = ("what goes wrong", "heard", "refused", "wrong of accepted", "within 1 m, 1°", "within 3 m, 3°")
-    return [*tables, Table("disturbances_poses", "BEVGlue's poses under the same", columns, rows)]
+    columns = ("disturbance", "received", "refused", "wrong of accepted", "within 1 m, 1°", "within 3 m, 3°")
+    return [*tables, Table("disturbances_poses", "BEVGlue's poses under disturbances", columns, rows)]
 
 
 FURTHER = Experiment(

@@ -49,7 +49,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
             rows.append(row)
         notes: tuple[str, ...] = (
             "Columns: standard deviation of x and y in metres / of yaw in degrees, on the poses of all agents.",
-            "CoBEVGlue is really run at every level; no collaboration and true poses cannot differ and are run once.",
+            "CoBEVGlue is run at every level; no collaboration and true poses do not depend on it and are run once.",
         )
         notes += PAPERS if published else ()
         tables.append(Table(f"noise_ap{iou:g}", f"AP@{iou:g} under localisation noise", columns, rows, notes))

@@ -77,7 +77,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
     )
     notes = (
         f"CoBEVGlue's fusion on one frame in {every}; bytes are of one collaborator in one frame, for alignment only.",
-        "What a cloud has after thinning out may be less than the budget.",
+        "A sampled cloud may be smaller than the budget.",
         "Initial pose: ICP starts from claimed poses with this noise, in metres and degrees on every agent; the others "
         "need none.",
     )
@@ -85,7 +85,7 @@ def _tables(scope: Scope, results: Results, dataset: str) -> list[Table]:
 
 
 def registration_points(scope: Scope, results: Results, iou: float) -> list[tuple[str, float, float]]:
-    """Label, bytes and average precision of every row: for a figure. Ego only sends nothing."""
+    """Label, bytes and average precision of every row: for a figure. The ego alone sends nothing."""
     every = scope.registration_every
     points = []
     for (label, _), condition in _all_rows(scope).items():

@@ -32,7 +32,7 @@ def summary(scope: Scope, parts: Mapping[str, Results]) -> Table:
     }
     rows: list[list[Cell]] = [
         ["frames", *(results.frame_count for results in parts.values())],
-        ["objects that count", *(results.object_count for results in parts.values())],
+        ["evaluated objects", *(results.object_count for results in parts.values())],
     ]
     for iou in (0.5, 0.7):
         for title, condition in asked.items():
@@ -58,7 +58,7 @@ def _below(scope: Scope, results: Results) -> str | None:
 
 
 def _above_again(scope: Scope, results: Results) -> str | None:
-    """How many methods are better than no collaboration under attack, without and with BEVGlue."""
+    """Number of methods that are better than no collaboration under attack, without and with BEVGlue."""
     pairs = [(attacked(name), attacked(name, "bevglue")) for name in scope.trusting]
     if not all(results.has(condition) for pair in pairs for condition in pair) or not results.has(as_is("none")):
         return None
