@@ -24,7 +24,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from cobevglue.alignment.alignment import Alignment
 from cobevglue.alignment.procrustes import procrustes
@@ -89,6 +88,8 @@ class Levelling:
     @property
     def level_SE3_other(self) -> FloatArray:
         """(4, 4) from the other's frame to its level frame: upright, at the height of the ego's xy plane."""
+        from scipy.spatial.transform import Rotation  # here, as it slows down the import of the package
+
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_euler("ZYX", [0.0, self.pitch, self.roll]).as_matrix()
         matrix[2, 3] = self.z

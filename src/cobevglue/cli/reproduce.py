@@ -216,7 +216,7 @@ def _progress_bar() -> Iterator[Callable[[str, float, float], None]]:
         if not console.is_terminal and time.perf_counter() - noted > 60.0:  # in a log, one line per minute
             noted = time.perf_counter()
             left = bar.tasks[tasks[label]].time_remaining
-            print_note(f"{label}: {done / total:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))
+            print_note(f"{label}: {done / total if total else 1.0:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))
 
     try:
         yield show

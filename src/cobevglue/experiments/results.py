@@ -156,7 +156,7 @@ def write_result(path: Path, result: ScenarioResult) -> None:
                 {
                     "frame": index,
                     "boxes": len(frame.boxes),
-                    "received": [_finite(asdict(pose)) for pose in frame.received],
+                    "heard": [_finite(asdict(pose)) for pose in frame.received],
                     "seconds": frame.seconds,
                 }
                 for index, frame in run.frames.items()
@@ -210,7 +210,7 @@ def _result(document: Mapping[str, Any], boxes: FloatArray, truth: FloatArray) -
     for one in document["conditions"]:
         frames = {}
         for frame in one["frames"]:
-            received = tuple(ReceivedPose(**_infinite(part)) for part in frame["received"])
+            received = tuple(ReceivedPose(**_infinite(part)) for part in frame["heard"])
             frames[frame["frame"]] = FrameResult(_boxes(boxes[row : row + frame["boxes"]]), received, frame["seconds"])
             row += frame["boxes"]
         condition = Condition(**one["condition"])
