@@ -216,7 +216,8 @@ def _progress_bar() -> Iterator[Callable[[str, float, float], None]]:
         if not console.is_terminal and time.perf_counter() - noted > 60.0:  # in a log, one line per minute
             noted = time.perf_counter()
             left = bar.tasks[tasks[label]].time_remaining
-            print_note(f"{label}: {done / total if total else 1.0:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))
+            share = done / total if total else 1.0  # 0 of 0: all results were stored before
+            print_note(f"{label}: {share:.0%}" + (f", {left / 60:.0f} minutes left" if left else ""))
 
     try:
         yield show
